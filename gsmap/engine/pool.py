@@ -19,6 +19,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
+from gsmap import platform
 from gsmap.errors import GsmapError
 from gsmap.methods.executor import QuarantinedJob
 from gsmap.types.progress import jobs_progress
@@ -29,6 +30,8 @@ _NOT_TO_WORKERS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 _RECENT_JOBS = 4
 """Number of a worker's recent jobs that its next job should share inputs with, about as many as the worker caches."""
+
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _MAX_LOSSES = 2
 """Number of lost processes after which a job is quarantined."""
@@ -52,9 +55,14 @@ class _Task:
 
 
 class Worker:
-    """A process that runs one job after another."""
+    """A process that runs one job after another.
 
-    def __init__(self) -> None:
+    Args:
+        threads: number of threads of its native code and of the libraries that it uses; None leaves it to the
+            environment.
+    """
+
+    def __init__(self, threads: int | None = None) -> None:
         self.connection, worker_end = Pipe()
         self.has_begun = False
         self.read: deque[frozenset[Hashable]] = deque(maxlen=_RECENT_JOBS)
@@ -62,7 +70,9 @@ class Worker:
         command = [*command[: command.index("-c")], str(_WORKER), str(worker_end.fileno()), str(os.getpid())]
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _NOT_TO_WORKERS)  # which the process inherits
         try:
-            self._process = subprocess.Popen(command, pass_fds=(worker_end.fileno(),), stdin=subprocess.DEVNULL)
+            self._process = subprocess.Popen(
+                command, pass_fds=(worker_end.fileno(),), stdin=subprocess.DEVNULL, env=_environment(threads)
+            )
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             worker_end.close()
@@ -119,12 +129,24 @@ class Worker:
         return WorkerDeath(f"its process ended by {signal.Signals(-code).name if code < 0 else f'exit code {code}'}")
 
 
+def _environment(threads: int | None) -> dict[str, str]:
+    """Return the environment of a worker; variables that the user has set stay."""
+    own = {} if threads is None else dict.fromkeys(_THREAD_VARIABLES, str(threads))
+    return own | os.environ
+
+
 class Pool:
-    """A pool of at most ``size`` workers, which start on demand and are kept between runs until the pool is closed."""
+    """A pool of at most ``size`` workers, which start on demand and are kept between runs until the pool is closed.
+
+    Workers share the processors: each runs as many threads as there are processors for it.
+    """
 
     def __init__(self, size: int) -> None:
         self.size = size
         self._idle: list[Worker] = []
+
+    def _new_worker(self) -> Worker:
+        return Worker(max(platform.num_processors() // self.size, 1))
 
     @property
     def num_idle(self) -> int:
@@ -226,12 +248,12 @@ class Pool:
                 worker.kill()
 
     def _any(self) -> Worker:
-        return self._idle.pop() if self.num_idle else Worker()
+        return self._idle.pop() if self.num_idle else self._new_worker()
 
     def _matched(self, ahead: deque[_Task]) -> tuple[Worker, _Task]:
         """Choose the idle worker and waiting job that share most input data; without an idle worker, start one."""
         if not self.num_idle:
-            return Worker(), ahead.popleft()
+            return self._new_worker(), ahead.popleft()
         known = [set().union(*worker.read) for worker in self._idle]
         shared = {(i, j): len(task.reads & read) for j, task in enumerate(ahead) for i, read in enumerate(known)}
         i, j = max(shared, key=shared.__getitem__)

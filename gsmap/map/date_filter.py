@@ -55,3 +55,10 @@ def undated_note(scenes: Sequence[Scene], as_of: str) -> str:
     shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     have = "has no date" if len(names) == 1 else "have no date"
     return f"{shown} {have}, so whether there by {as_of} is not known: left out ({NO_DATE})"
+
+
+def capture_time(captured_at: str | None, came_at: str | None) -> tuple[bool, float, str]:
+    """Return a sort key of scenes and photos: dated ones by date, then undated ones by arrival."""
+    if captured_at is None:
+        return True, 0.0, came_at or ""
+    return False, parse_moment(captured_at).timestamp(), came_at or ""

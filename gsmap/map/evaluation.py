@@ -66,8 +66,10 @@ def poses(
 
     params = params or Params()
     solid = partial(_solid, store, S_scene_world)
-    overlaps = true_overlaps(list(S_scene_world), solid)
-    of_scenes, edges, graph = [judged(s) for s in scenes], reports.edge_rows(store), store.revisions.get()
+    with store.located():
+        overlaps = true_overlaps(list(S_scene_world), solid)
+        of_scenes = [judged(s) for s in scenes]
+    edges, graph = reports.edge_rows(store), store.revisions.get()
     return evaluate_map(of_scenes, edges, graph, overlaps, params, metres)
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from gsmap.map.date_filter import capture_time
 from gsmap.store import Store
 from gsmap.store.objects import number_of
 from gsmap.texts import few
-from gsmap.types import MapObject, ObjectAnnotations, Scene
+from gsmap.types import MapObject, ObjectAnnotations, ObjectObservation, Scene
 
 
 def why_distinct(one: MapObject, other: MapObject, scenes: Mapping[str, Scene]) -> str:
@@ -31,6 +32,8 @@ def apply_annotations(
     words, notes = store.objects.annotations(), []
     of = {thing.id: replace(thing, words=words.get(thing.id, ObjectAnnotations())) for thing in objects}
     joined: dict[str, str] = {}
+    ordered = sorted(scenes.values(), key=lambda scene: capture_time(scene.captured_at, scene.ingested_at))
+    rank = {scene.id: i for i, scene in enumerate(ordered)}
     for thing in list(of.values()):
         target = _end_of(thing.words.same_as, words, of, joined)
         if not target or target == thing.id:
@@ -38,7 +41,7 @@ def apply_annotations(
         if why := why_distinct(of[thing.id], of[target], scenes):
             notes.append(f"{thing.id} is not joined with {target}, although annotated as the same: {why}")
             continue
-        of[target] = _as_one(of[target], of.pop(thing.id))
+        of[target] = _as_one(of[target], of.pop(thing.id), rank)
         joined = {one: target if to == thing.id else to for one, to in joined.items()} | {thing.id: target}
     for name, said in words.items():
         if name not in of and name not in joined and (number := number_of(name)) is not None:
@@ -60,22 +63,28 @@ def _end_of(
     return at if at in of else ""
 
 
-def _as_one(one: MapObject, other: MapObject) -> MapObject:
+def _as_one(one: MapObject, other: MapObject, rank: Mapping[str, int]) -> MapObject:
     """Join two objects of one component into the first. For a scene in which neither object has a segment, keep the
     observation of the object that was seen nearest in time.
+
+    Args:
+        rank: place of each scene in the order of time.
     """
-    shown = [[i for i, s in enumerate(thing.sightings) if s.thing >= 0] for thing in (one, other)]
+    shown = [[rank[s.scene] for s in thing.sightings if s.thing >= 0] for thing in (one, other)]
+    pairs: dict[str, list[tuple[int, ObjectObservation]]] = {}
+    for k, thing in enumerate((one, other)):
+        for sighting in thing.sightings:
+            pairs.setdefault(sighting.scene, []).append((k, sighting))
     sightings = []
-    for i, pair in enumerate(zip(one.sightings, other.sightings, strict=True)):
-        order = sorted(
-            range(2),
-            key=lambda k: (
-                pair[k].thing < 0,
-                pair[k].state != "seen",
-                min((abs(i - j) for j in shown[k]), default=len(one.sightings)),
-            ),
-        )
-        sightings.append(pair[order[0]])
+    for scene in sorted(pairs, key=rank.__getitem__):
+        i = rank[scene]
+
+        def order(pair: tuple[int, ObjectObservation], i: int = i) -> tuple[bool, bool, bool, int]:
+            k, sighting = pair
+            nearest = min((abs(i - j) for j in shown[k]), default=len(rank))
+            return sighting.thing < 0, sighting.state != "seen", sighting.state == "unseen", nearest
+
+        sightings.append(min(pairs[scene], key=order)[1])
     last = one if max(shown[0], default=-1) >= max(shown[1], default=-1) else other
     words = ObjectAnnotations(
         one.words.name or other.words.name,

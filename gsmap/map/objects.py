@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import numpy as np
 from gsmap.durable import write_text_output
 from gsmap.errors import ConfigError, DiskFullError, InputError, NotFoundError, ReadOnlyError
 from gsmap.geometry.directions import level_frame
+from gsmap.map.date_filter import capture_time
 from gsmap.map.object_annotations import apply_annotations, why_distinct
 from gsmap.map.photos import add_photo_observations
 from gsmap.map.settings import Settings
@@ -27,7 +27,7 @@ from gsmap.store import Store
 from gsmap.store.facts import Fact
 from gsmap.store.objects import ComputedObjects, number_of
 from gsmap.texts import few
-from gsmap.types import MapObject, ObjectAnnotations, Room, Scene, SceneGraph
+from gsmap.types import MapObject, ObjectAnnotations, ObjectObservation, Room, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.base import SCHEMA
 from gsmap.types.rows.objects import (
@@ -56,55 +56,79 @@ class MapObjects:
         scenes: the placed scenes by id.
         notes: scenes without objects, with the reason.
         metres: metres per map unit, by component.
-        photos: (file, date) of the stored photos, by digest.
+        photos: (file, date, time at which it was added) of the stored photos, by digest.
         joined: id of the object into which each joined object was merged.
         facts: all annotations, by object id.
         rooms: rotation (3, 3) from the component's frame to a level one, and the rooms in that frame in metres.
         parted: id of the object from which each was split when its component fell apart.
         building: segments that are rather parts of the building than objects; they have numbers, too.
+        segmented: scenes with segments of each component, oldest first.
     """
 
     objects: list[MapObject]
     scenes: dict[str, Scene]
     notes: tuple[str, ...]
     metres: dict[int, float]
-    photos: Mapping[str, tuple[str, str | None]] = field(default_factory=dict)
+    photos: Mapping[str, tuple[str, str | None, str]] = field(default_factory=dict)
     joined: Mapping[str, str] = field(default_factory=dict)
     facts: Mapping[str, Sequence[Fact]] = field(default_factory=dict)
     rooms: Mapping[int, tuple[np.ndarray, tuple[Room, ...]]] = field(default_factory=dict)
     parted: Mapping[str, str] = field(default_factory=dict)
     building: Sequence[MapObject] = ()
+    segmented: Mapping[int, Sequence[str]] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def dates(self) -> dict[str, str | None]:
         """Dates of scenes and photos, by id."""
-        of_photos = {photo: when for photo, (_, when) in self.photos.items()}
+        of_photos = {photo: when for photo, (_, when, _) in self.photos.items()}
         return {scene.id: scene.captured_at for scene in self.scenes.values()} | of_photos
 
     def name_of(self, who: str) -> str:
         """Return the name of a scene or photo."""
         return self.scenes[who].name if who in self.scenes else self.photos[who][0]
 
+    def all_sightings(self, thing: MapObject) -> list[ObjectObservation]:
+        """Return the observations of an object by the segmented scenes of its component and by photos, oldest first."""
+        known = {one.scene: one for one in thing.sightings}
+        scenes = self.segmented.get(thing.component, ())
+        every = [known.pop(scene, ObjectObservation(scene, "unseen", -1, None, 0.0)) for scene in scenes]
+        if not known:
+            return every
+        times = {one.id: capture_time(one.captured_at, one.ingested_at) for one in self.scenes.values()}
+        times |= {photo: capture_time(when, came) for photo, (_, when, came) in self.photos.items()}
+        return sorted([*every, *known.values()], key=lambda one: times[one.scene])
+
     @cached_property
     def rooms_of(self) -> dict[str, str]:
         """Room id of each object with a known room, by object id."""
         out = {}
-        for thing in self.objects:
-            level, mine = self.rooms.get(thing.component, (np.eye(3), ()))
-            at = level @ thing.position * self.metres[thing.component]
-            for i, room in enumerate(mine):
-                if room.holds(at):
-                    out[thing.id] = self._room_id(thing.component, i)
-                    break
+        for component, (level, rooms) in self.rooms.items():
+            mine = [thing for thing in self.objects if thing.component == component]
+            places = np.array([thing.position for thing in mine]).reshape(-1, 3) @ level.T * self.metres[component]
+            for i in reversed(range(len(rooms))):  # an object in two rooms belongs to the larger
+                low, high = rooms[i].box
+                near = ((places[:, :2] >= low[:2]) & (places[:, :2] <= high[:2])).all(1)
+                for k in np.flatnonzero(near):
+                    if rooms[i].holds(places[k]):
+                        out[mine[k].id] = self._room_id(component, i)
         return out
 
+    @cached_property
+    def _first_rooms(self) -> dict[int, int]:
+        """Number of rooms of the components before each component."""
+        counts = [len(self.rooms[component][1]) for component in sorted(self.rooms)]
+        return dict(zip(sorted(self.rooms), np.cumsum([0, *counts])[:-1].tolist(), strict=True))
+
     def _room_id(self, component: int, number: int) -> str:
-        before = sum(len(mine) for other, (_, mine) in self.rooms.items() if other < component)
-        return f"r{before + number + 1}"
+        return f"r{self._first_rooms[component] + number + 1}"
 
     def room_rows(self) -> tuple[RoomRow, ...]:
         """Return the rooms of all components, the largest of each component first."""
         rows = []
+        objects: dict[str, list[str]] = {}
+        for thing in self.objects:
+            if thing.id in self.rooms_of:
+                objects.setdefault(self.rooms_of[thing.id], []).append(thing.id)
         for component, (level, mine) in sorted(self.rooms.items()):
             unit = self.metres[component]
             for i, room in enumerate(mine):
@@ -118,7 +142,7 @@ class MapObjects:
                         size_m=room.box[1] - room.box[0],
                         area_m2=round(room.area_m2, 2),
                         doors=tuple(self._room_id(component, other) for other in room.doors),
-                        objects=tuple(thing for thing, where in self.rooms_of.items() if where == name),
+                        objects=tuple(objects.get(name, ())),
                     )
                 )
         return tuple(rows)
@@ -170,8 +194,9 @@ def compute_objects(
     """
     placed, scenes, metres, parts, notes = objects_of_components(store, settings, progress, graphs, make=make)
     objects = _numbered(store, parts)
-    shown = {number: [s.scene for s in one.sightings] for one in objects if (number := number_of(one.id))}
-    parted = {f"o{number}": f"o{other}" for number, other in store.objects.split_objects(shown).items()}
+    components = {scene: pose.component for scene, pose in placed.poses.items()}
+    known = {number: one.component for one in objects if (number := number_of(one.id))}
+    parted = {f"o{number}": f"o{other}" for number, other in store.objects.split_objects(known, components).items()}
     if parted:
         told = few([f"{one} from {other}" for one, other in parted.items()])
         notes = [*notes, f"components came apart, and objects with them: {told} were split"]
@@ -180,10 +205,9 @@ def compute_objects(
     kept = store.photos.list() if graphs is None else []
     if kept:
         at = {scene: pose.S_map_scene for scene, pose in placed.poses.items()}
-        components = {scene: pose.component for scene, pose in placed.poses.items()}
         objects = add_photo_observations(objects, kept, scenes, at, metres, components)
     progress("objects", 1.0, f"{len(objects)} objects")
-    photos = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at) for one in kept}
+    photos = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at, one.created_at) for one in kept}
     building = [one for one in objects if one.is_building and one.words == ObjectAnnotations()]
     left_out = {one.id for one in building}
     return MapObjects(
@@ -197,6 +221,7 @@ def compute_objects(
         rooms,
         parted,
         building,
+        {part.component: [scene for scene, things in part.made.things.items() if things] for part in parts},
     )
 
 
@@ -214,11 +239,12 @@ def _numbered(store: Store, parts: Sequence[ComponentObjects]) -> list[MapObject
     if saved is not None:
         made |= {part.component: kept.objects for part, kept in zip(new, saved, strict=True)}
     elif new:
-        numbers = iter(store.objects.match_numbers([one for part in new for one in part.places or ()]))
+        found = [places for part in new for places in part.places or () if places is not None]
+        numbers = iter(store.objects.match_numbers(found))
         for part in new:
             made[part.component] = [
-                thing if number is None else replace(thing, id=f"o{number}")
-                for thing, number in zip(part.made.objects, islice(numbers, len(part.made.objects)), strict=True)
+                thing if places is None or (number := next(numbers)) is None else replace(thing, id=f"o{number}")
+                for thing, places in zip(part.made.objects, part.places or (), strict=True)
             ]
     return [thing for part in parts for thing in made[part.component]]
 
@@ -337,7 +363,7 @@ def history_report(known: MapObjects, place: str | None, box: Sequence[float] | 
             component=thing.component,
         )
         for thing in chosen
-        for sighting in thing.sightings
+        for sighting in known.all_sightings(thing)
     ]
     notes = known.notes if chosen else (*known.notes, "no object was ever found there")
     words = [

@@ -15,7 +15,7 @@ from PIL import Image
 from gsmap.geometry.projection import in_image, project
 from gsmap.geometry.transforms import transform_poses
 from gsmap.localize import PhotoComparison
-from gsmap.map.date_filter import parse_moment
+from gsmap.map.date_filter import capture_time
 from gsmap.map.photo_poses import photo_pose_of
 from gsmap.store import Store
 from gsmap.store.photos import MAX_BYTES, StoredPhoto
@@ -190,8 +190,8 @@ def add_photo_observations(
             if number is not None:
                 sighting = ObjectObservation(one.digest, thing.state, -1, None, thing.share)
                 said.setdefault(number, {}).setdefault(one.digest, sighting)
-    whens = {scene.id: _when(scene.captured_at, scene.ingested_at) for scene in scenes.values()}
-    whens |= {photo.sighting.digest: _when(photo.sighting.captured_at, photo.created_at) for photo in kept}
+    whens = {scene.id: capture_time(scene.captured_at, scene.ingested_at) for scene in scenes.values()}
+    whens |= {photo.sighting.digest: capture_time(photo.sighting.captured_at, photo.created_at) for photo in kept}
     out = list(objects)
     for number, sightings in said.items():
         everything = [*objects[number].sightings, *sightings.values()]
@@ -213,13 +213,6 @@ def _at(objects: Sequence[MapObject], component: int, at: np.ndarray, near: floa
             if distance < far:
                 best, far = number, distance
     return best
-
-
-def _when(captured_at: str | None, came_at: str | None) -> tuple[bool, float, str]:
-    """Return a sort key: dated items by date, then undated items by arrival."""
-    if captured_at is None:
-        return True, 0.0, came_at or ""
-    return False, parse_moment(captured_at).timestamp(), came_at or ""
 
 
 def photo_rows(store: Store) -> list[PhotoRow]:

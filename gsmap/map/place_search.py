@@ -251,7 +251,8 @@ def _index(store: Store, settings: Settings, progress: StageProgress, *, present
             "part: gsmap update describes them"
         )
     keys_of = thinned | made[recipe]
-    graphs = {scene: store.graphs.load(scene, key) for scene, key in keys_of.items()}
+    with store.located():
+        graphs = {scene: store.graphs.load(scene, key) for scene, key in keys_of.items()}
     there = {scene: graph for scene, graph in graphs.items() if graph is not None}
     known = compute_objects(store, settings, progress, there)
     num_described = len(there.keys() & made[recipe].keys())

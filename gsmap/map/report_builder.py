@@ -167,7 +167,8 @@ class _ReportBuilder:
     def report(self, pictures: bool) -> Report:
         self.progress("report", 0.0, "reading the catalog")
         state = _state(self.store, self.settings, self.since)
-        reads = self._arrays(state)
+        with self.store.located():
+            reads = self._arrays(state)
         edges = _edges(state, reads)
         islands = self._islands(state, reads, edges)
         made = replace(

@@ -2,12 +2,14 @@
 other."""
 
 from gsmap.objects.changed_segments import find_changed_segment
+from gsmap.objects.component_scenes import ComponentScenes, MatchedSegments, SegmentedScene, SegmentRef
 from gsmap.objects.fuse import PlacedSegments, SegmentId, fuse
 from gsmap.objects.graph import graphml, object_graph
-from gsmap.objects.make import VERSION, Params, SegmentedScene, make_objects, recipe_key
+from gsmap.objects.make import VERSION, Params, make_objects, recipe_key, update_objects
 from gsmap.objects.persistence import Persistence, estimate_persistence
 from gsmap.objects.relations import Relation, relations
-from gsmap.objects.rooms import find_rooms
+from gsmap.objects.room_tiles import is_small, update_rooms
+from gsmap.objects.rooms import SurfacePoints, find_rooms, sample_surface, surface_rows
 from gsmap.objects.visibility import (
     PointObservations,
     RenderedViews,
@@ -19,25 +21,34 @@ from gsmap.objects.visibility import (
 
 __all__ = [
     "VERSION",
-    "SegmentedScene",
-    "RenderedViews",
-    "PointObservations",
-    "SegmentId",
+    "ComponentScenes",
+    "MatchedSegments",
     "Params",
     "Persistence",
     "PlacedSegments",
+    "PointObservations",
     "Relation",
+    "RenderedViews",
+    "SegmentId",
+    "SegmentRef",
+    "SegmentedScene",
+    "SurfacePoints",
+    "classify_observation",
+    "estimate_persistence",
     "find_changed_segment",
     "find_rooms",
     "fuse",
-    "observe_points",
     "graphml",
     "is_in_view",
-    "classify_observation",
+    "is_small",
     "make_objects",
     "object_graph",
-    "render_views",
-    "estimate_persistence",
+    "observe_points",
     "recipe_key",
     "relations",
+    "render_views",
+    "sample_surface",
+    "surface_rows",
+    "update_objects",
+    "update_rooms",
 ]

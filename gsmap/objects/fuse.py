@@ -9,7 +9,9 @@ import numpy as np
 
 from gsmap.geometry.cells import cell_labels, group_means
 
-_CELL_M = 0.12  # edge of the cells by which segments are compared
+CELL_M = 0.12
+"""Edge of the cells by which segments are compared, in metres."""
+
 _MIN_OVERLAP_OF_LARGER = 0.2  # two segments of one object share at least this fraction of the larger segment's cells
 _MAX_LAB = 15.0  # largest median difference of their colours, after exposure balancing
 _MIN_IOU = 0.4  # with at least this IoU the colours may differ, because the object was painted
@@ -82,7 +84,7 @@ def _cells(captures: Sequence[PlacedSegments]) -> tuple[np.ndarray, np.ndarray, 
     points = np.concatenate([capture.points for capture in captures]).reshape(-1, 3)
     lab = np.concatenate([capture.lab for capture in captures]).reshape(-1, 3)
     nodes = np.concatenate([first[i] + capture.segments for i, capture in enumerate(captures)]).astype(np.int64)
-    label, _ = cell_labels(np.floor(points / _CELL_M))
+    label, _ = cell_labels(np.floor(points / CELL_M))
     cells, row, counts = np.unique(np.column_stack([label, nodes]), axis=0, return_inverse=True, return_counts=True)
     return first, cells, group_means(lab, row.reshape(-1), counts)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -11,13 +12,21 @@ from gsmap import render as rendering
 from gsmap.geometry.directions import level_frame
 from gsmap.methods import RecipeKey, text_digest
 from gsmap.objects.building_parts import is_building_part
-from gsmap.objects.fuse import PlacedSegments, SegmentId, fuse
+from gsmap.objects.component_scenes import (
+    ComponentScenes,
+    Match,
+    SegmentedScene,
+    SegmentRef,
+    boxes_meet,
+    no_match,
+)
+from gsmap.objects.regroup import Group, regroup
 from gsmap.objects.visibility import LONGEST_SIDE_PX, MAX_VIEWS, RenderedViews, classify_observation, observe_points
-from gsmap.types import MapObject, ObjectObservation, ObservationState, Segments, Sim3
+from gsmap.types import MapObject, ObjectObservation, ObservationState
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
-VERSION = 2
+VERSION = 3
 """Version, raised whenever the objects of the same scenes change, also through other modules of `gsmap.objects`."""
 
 _FLOOR_AND_CEILING = (0.01, 0.995)  # quantiles of the heights of a scene's segments
@@ -51,19 +60,26 @@ def recipe_key(params: Params | None = None) -> RecipeKey:
     return RecipeKey("objects", "fused", {"objects": VERSION}, plain(params or Params()), rendering.backend())
 
 
-@dataclass(frozen=True, eq=False)
-class SegmentedScene:
-    """A scene with a pose and segments.
+@dataclass(eq=False)
+class _Object:
+    """An object while its observations are collected.
 
     Args:
-        scene: id of the scene.
-        S_map_scene: pose of the scene.
-        segments: segments of its scene graph.
+        members: its segment in each scene that shows it, oldest scene first.
+        observations: by scene.
+        earlier: the same object of an earlier run; None for a new object.
     """
 
-    scene: str
-    S_map_scene: Sim3
-    segments: Segments
+    members: dict[str, int]
+    observations: dict[str, ObjectObservation] = field(default_factory=dict)
+    earlier: MapObject | None = None
+
+    @cached_property
+    def box(self) -> np.ndarray:
+        """Box (2, 3) around the places of all its segments."""
+        boxes = [self.observations[scene].box for scene in self.members]
+        found = np.array([box for box in boxes if box is not None])
+        return np.array([found[:, 0].min(0), found[:, 1].max(0)])
 
 
 def make_objects(
@@ -73,131 +89,209 @@ def make_objects(
     *,
     metres: float = 1.0,
     up: np.ndarray | None = None,
-    moved: Sequence[tuple[SegmentId, SegmentId]] = (),
-    parted: Sequence[tuple[SegmentId, int]] = (),
-    find_earlier: Callable[[int, SegmentId], tuple[ObservationState, float] | None] = lambda capture, node: None,
+    match: Match = no_match,
+) -> list[MapObject]:
+    """Construct the objects of some scenes, oldest first, that may all see each other; see `update_objects`."""
+    return update_objects(ComponentScenes.of(captures), component, render, metres=metres, up=up, match=match)
+
+
+def update_objects(
+    scenes: ComponentScenes,
+    component: int,
+    render: Callable[[SegmentedScene], RenderedViews],
+    *,
+    earlier: Sequence[MapObject] = (),
+    changed: Collection[str] | None = None,
+    touched: Sequence[np.ndarray] = (),
+    metres: float = 1.0,
+    up: np.ndarray | None = None,
+    match: Match = no_match,
     in_frustum: Callable[[SegmentedScene, np.ndarray], bool] = lambda capture, points: True,
     params: Params | None = None,
     progress: Progress = silent,
 ) -> list[MapObject]:
     """Construct the objects of one component of the map, the largest first, and after them parts of the building.
 
-    A scene is rendered at most once, and only if an object of other scenes lies in the frustum of its cameras. So the
-    cost of a scene depends only on its own segments and on the objects at its place.
+    Only segments near changed scenes are associated anew, and only pairs of an object and a scene are observed of which
+    one is new and whose boxes meet. A scene is rendered at most once. So the cost of a new scene depends only on its
+    own segments and on the objects at its place.
 
     Args:
-        captures: scenes of the component, oldest first.
-        render: function that renders the views of a scene; it is called at most once for each scene.
+        scenes: scenes of the component.
+        render: function that renders the views of a scene.
+        earlier: objects of an earlier run, in the frame of the scenes.
+        changed: scenes that are new, moved or described anew since; default: all.
+        touched: boxes (2, 3) around the segments that scenes had at that time and have no more, map frame and unit.
         metres: metres per unit of the map.
         up: (3,) direction against gravity in the map frame; default: z.
-        moved: pairs of segments, by index, of one moved object.
-        parted: pairs of a segment and the index of a scene that does not show the segment in place.
-        find_earlier: function that returns, from an earlier run, the state and observed fraction of a segment of
-            another scene in a scene (by index); None if it has to be observed now.
+        match: function that returns what comparisons of some scenes say of their segments; default: nothing.
         in_frustum: function that returns whether a camera of a scene has any of the points (scene frame and unit) in
             its frustum.
         params: see `Params`.
         progress: called with the fraction done in [0, 1] and the current step.
     """
     params = params or Params()
-    if not captures:
+    changed = set(scenes.order if changed is None else changed)
+    if not scenes.order:
         return []
-    placed = [_placed(capture, metres) for capture in captures]
-    groups = fuse(placed, moved, parted, params.min_overlap)
-    gone = set(parted)
-    kept = []
+    known = [_strip(one, scenes, changed) for one in earlier]
+    broken = {i for i, one in enumerate(known) if len(one.members) < sum(s.thing >= 0 for s in earlier[i].sightings)}
+    members = [one.members for one in known]
+    groups, kept, told = regroup(scenes, members, broken, changed, touched, metres, params.min_overlap, match)
+    objects = [known[i] for i in kept]
     for group in groups:
-        rows = {c: np.flatnonzero(placed[c].segments == t) for c, t in group}
-        places = {c: (placed[c].points[mine] / metres, placed[c].lab[mine]) for c, mine in rows.items()}
-        members = max(np.count_nonzero(captures[c].segments.members == t) for c, t in group)
-        if members >= params.min_gaussians:
-            kept.append((group, places))
-    sightings: list[dict[int, ObjectObservation]] = [
-        {
-            c: ObjectObservation(captures[c].scene, "seen", t, np.array([at[c][0].min(0), at[c][0].max(0)]))
-            for c, t in group
-        }
-        for group, at in kept
-    ]
-    for c, capture in enumerate(captures):
-        progress(c / max(len(captures), 1), f"observing {len(kept)} objects in scene {c + 1} of {len(captures)}")
-        # The scene nearest in time provides the expected place of each object.
-        of = [min((o for o in at if o != c), key=lambda o: (abs(o - c), o), default=c) for _, at in kept]
-        points = [places[o][0] for (_, places), o in zip(kept, of, strict=True)]
-        S_scene_map, unit = capture.S_map_scene.inverse(), metres * capture.S_map_scene.scale
-        results: dict[int, tuple[ObservationState, float]] = {}
-        to_observe = []
-        for i, mine in enumerate(sightings):
-            if c in mine:
-                continue
-            before = find_earlier(c, (of[i], sightings[i][of[i]].thing))
-            if before is not None:
-                results[i] = before
-            elif in_frustum(capture, S_scene_map.apply(points[i])):
-                to_observe.append(i)
-            else:
-                sightings[i][c] = ObjectObservation(capture.scene, "unseen", -1, None, 0.0)
-        if to_observe:
-            seen = render(capture)
-            own = [places[o][1] for (_, places), o in zip(kept, of, strict=True)]
-            # Estimate exposure from objects that the scene certainly shows or, without any, from all objects with a
-            # surface in place.
-            sure = [i for i, mine in enumerate(sightings) if c in mine] or to_observe
-            observations = {
-                i: observe_points(seen, S_scene_map.apply(points[i]), unit) for i in dict.fromkeys([*sure, *to_observe])
-            }
-            off = np.concatenate([(observations[i].colours - own[i])[observations[i].on] for i in sure])
-            shift = np.median(off, axis=0) if len(off) else np.zeros(3)
-            for i in to_observe:
-                results[i] = classify_observation(observations[i], points[i] * metres, own[i], shift)
-        for i, (state, share) in results.items():
-            observed_at = captures[of[i]].scene
-            if any((node, c) in gone for node in kept[i][0]):
-                state, observed_at = "absent", ""  # a review may revert it, so it is not kept as an observation
-            box = np.array([points[i].min(0), points[i].max(0)]) if state == "seen" else None
-            sightings[i][c] = ObjectObservation(capture.scene, state, -1, box, share, observed_at)
-    is_building = _building_parts(placed, [group for group, _ in kept], up)
-    objects = []
-    for (group, _), mine, of_building in zip(kept, sightings, is_building, strict=True):
-        first, last = group[0], group[-1]
-        own = captures[first[0]].segments.positions[first[1]] * captures[first[0]].segments.unit_m
-        name = text_digest(f"{captures[first[0]].scene} {np.round(own, 1).tolist()}")[:8]
-        box = mine[last[0]].box
-        assert box is not None
-        middle = captures[last[0]].S_map_scene.apply(captures[last[0]].segments.positions[last[1]][None])[0]
-        colour = captures[last[0]].segments.colours[last[1]]
-        observed = tuple(mine[c] for c in range(len(captures)))
-        objects.append(MapObject(name, component, box, middle, colour, observed, is_building=of_building))
-    objects.sort(key=lambda obj: (obj.is_building, -float(np.prod(obj.box[1] - obj.box[0])), obj.id))
-    return _distinct(objects)
-
-
-def _building_parts(
-    placed: Sequence[PlacedSegments], groups: Sequence[tuple[SegmentId, ...]], up: np.ndarray | None
-) -> list[bool]:
-    """Return whether each group of segments is a part of the building, by its segment with most samples."""
+        if max(scenes.load(scene).num_members[segment] for scene, segment in group) >= params.min_gaussians:
+            objects.append(_new(scenes, group))
+    before = {
+        (one.scene, one.asked, known[i].members[one.asked]): one
+        for i in set(range(len(known))).difference(kept)
+        for one in known[i].observations.values()
+        if one.asked in known[i].members
+    }
+    shown: dict[str, list[int]] = {}
+    for i, one in enumerate(objects):
+        for scene in one.members:
+            shown.setdefault(scene, []).append(i)
+    asked = _pairs_to_observe(scenes, objects, changed)
+    for done, (scene, some) in enumerate(asked.items()):
+        progress(done / len(asked), f"observing {len(some)} objects in scene {done + 1} of {len(asked)}")
+        _observe(scenes, objects, shown, scene, some, before, set(told.parted), metres, render, in_frustum)
     level = np.eye(3) if up is None else level_frame(up)
-    points = [capture.points @ level.T for capture in placed]
-    ends = [np.quantile(one[:, 2], _FLOOR_AND_CEILING) if len(one) else np.zeros(2) for one in points]
-    out = []
-    for group in groups:
-        rows = {c: np.flatnonzero(placed[c].segments == t) for c, t in group}
-        c = max(rows, key=lambda one: len(rows[one]))
-        out.append(is_building_part(points[c][rows[c]], placed[c].lab[rows[c]], *ends[c].tolist()))
-    return out
+    return _sorted([_finished(scenes, one, component, level, metres) for one in objects])
 
 
-def _placed(capture: SegmentedScene, metres: float) -> PlacedSegments:
-    """Return the sample points of every segment, in metres of the map."""
-    segments = capture.segments
-    points = capture.S_map_scene.apply(segments.samples) * metres
-    return PlacedSegments(
-        points, np.repeat(np.arange(len(segments)), segments.sample_counts), segments.sample_colours, len(segments)
+def _strip(thing: MapObject, scenes: ComponentScenes, changed: Collection[str]) -> _Object:
+    """Return an earlier object without its observations by changed scenes and by scenes that are gone."""
+    stays = {one.scene: one for one in thing.sightings if one.scene in scenes.rank and one.scene not in changed}
+    members = {scene: one.thing for scene, one in stays.items() if one.thing >= 0}
+    return _Object(members, stays, thing)
+
+
+def _new(scenes: ComponentScenes, group: Group) -> _Object:
+    made = _Object(dict(group))
+    for scene, segment in group:
+        points, _ = scenes.samples((scene, segment))
+        box = np.array([points.min(0), points.max(0)])
+        made.observations[scene] = ObjectObservation(scene, "seen", segment, box)
+    return made
+
+
+def _pairs_to_observe(
+    scenes: ComponentScenes, objects: Sequence[_Object], changed: Collection[str]
+) -> dict[str, list[int]]:
+    """Return the indices of the objects that each scene may observe for the first time, by scene in order of time.
+
+    A new object is observed by all scenes, and an earlier one by changed scenes, wherever their boxes meet.
+    """
+    ids = [scene for scene in scenes.order if scene in scenes.views]
+    if not ids or not objects:
+        return {}
+    out: dict[str, list[int]] = {scene: [] for scene in ids}
+    is_new = np.array([one.earlier is None for one in objects])
+    for rows, some in (
+        (np.flatnonzero(is_new).tolist(), ids),
+        (np.flatnonzero(~is_new).tolist(), [scene for scene in ids if scene in changed]),
+    ):
+        if not len(rows) or not some:
+            continue
+        views, boxes = np.array([scenes.views[scene] for scene in some]), np.array([objects[i].box for i in rows])
+        for at, row in np.argwhere(boxes_meet(views, boxes)).tolist():
+            if some[at] not in objects[rows[row]].members:
+                out[some[at]].append(rows[row])
+    return {scene: sorted(asked) for scene, asked in out.items() if asked}
+
+
+def _observe(
+    scenes: ComponentScenes,
+    objects: Sequence[_Object],
+    shown: Mapping[str, Sequence[int]],
+    scene: str,
+    asked: Sequence[int],
+    before: Mapping[tuple[str, str, int], ObjectObservation],
+    parted: Collection[tuple[SegmentRef, str]],
+    metres: float,
+    render: Callable[[SegmentedScene], RenderedViews],
+    in_frustum: Callable[[SegmentedScene, np.ndarray], bool],
+) -> None:
+    """Observe objects in one scene, and add the observations to them.
+
+    Args:
+        shown: indices of the objects that each scene has a segment of.
+        asked: indices of the objects.
+        before: earlier observations that still hold, by scene and expected segment.
+        parted: see `MatchedSegments`.
+    """
+    capture = scenes.load(scene)
+    S_scene_map, unit = capture.S_map_scene.inverse(), metres * capture.S_map_scene.scale
+    # The scene nearest in time provides the expected place of each object.
+    expected = {i: scenes.nearest_in_time(objects[i].members, scene) for i in asked}
+    results: dict[int, tuple[ObservationState, float]] = {}
+    to_observe = []
+    for i in asked:
+        old = before.get((scene, *expected[i]))
+        if old is not None:
+            results[i] = old.state, old.looked
+        elif in_frustum(capture, S_scene_map.apply(scenes.samples(expected[i])[0])):
+            to_observe.append(i)
+    if to_observe:
+        seen = render(capture)
+        # Estimate exposure from objects that the scene certainly shows or, without any, from all objects with a surface
+        # in place.
+        sure = shown.get(scene) or to_observe
+        expected |= {i: scenes.nearest_in_time(objects[i].members, scene) for i in sure}
+        samples = {i: scenes.samples(expected[i]) for i in dict.fromkeys([*sure, *to_observe])}
+        found = {i: observe_points(seen, S_scene_map.apply(points), unit) for i, (points, _) in samples.items()}
+        off = np.concatenate([(found[i].colours - samples[i][1])[found[i].on] for i in sure])
+        shift = np.median(off, axis=0) if len(off) else np.zeros(3)
+        for i in to_observe:
+            points, own = samples[i]
+            results[i] = classify_observation(found[i], points * metres, own, shift)
+    for i, (state, share) in results.items():
+        asked_of = expected[i][0]
+        if any((segment, scene) in parted for segment in objects[i].members.items()):
+            state, asked_of = "absent", ""  # a review may revert it, so it is not kept as an observation
+        if state == "unseen" and not share:
+            continue
+        points = scenes.samples(expected[i])[0]
+        box = np.array([points.min(0), points.max(0)]) if state == "seen" else None
+        objects[i].observations[scene] = ObjectObservation(scene, state, -1, box, share, asked_of)
+
+
+def _finished(scenes: ComponentScenes, made: _Object, component: int, level: np.ndarray, metres: float) -> MapObject:
+    """Return the object with its observations, oldest first."""
+    observed = tuple(sorted(made.observations.values(), key=lambda one: scenes.rank[one.scene]))
+    if made.earlier is not None:
+        same = made.earlier.component == component and observed == made.earlier.sightings
+        return made.earlier if same else replace(made.earlier, component=component, sightings=observed)
+    segments = list(made.members.items())
+    (first, segment), (last, shown) = segments[0], segments[-1]
+    oldest, newest = scenes.load(first).segments, scenes.load(last)
+    own = oldest.positions[segment] * oldest.unit_m
+    box = made.observations[last].box
+    assert box is not None
+    return MapObject(
+        text_digest(f"{first} {np.round(own, 1).tolist()}")[:8],
+        component,
+        box,
+        newest.S_map_scene.apply(newest.segments.positions[shown][None])[0],
+        newest.segments.colours[shown],
+        observed,
+        is_building=_is_building(scenes, segments, level, metres),
     )
 
 
-def _distinct(objects: list[MapObject]) -> list[MapObject]:
-    """Make ids unique if two objects have the same id by chance."""
+def _is_building(scenes: ComponentScenes, segments: Sequence[SegmentRef], level: np.ndarray, metres: float) -> bool:
+    """Return true if an object is a part of the building, by its segment with most samples."""
+    scene, segment = max(segments, key=lambda one: scenes.load(one[0]).segments.sample_counts[one[1]])
+    capture = scenes.load(scene)
+    heights = capture.points @ level[2] * metres
+    points, lab = scenes.samples((scene, segment))
+    return is_building_part(points @ level.T * metres, lab, *np.quantile(heights, _FLOOR_AND_CEILING).tolist())
+
+
+def _sorted(objects: list[MapObject]) -> list[MapObject]:
+    """Return the objects, the largest first, and after them parts of the building, with unique ids."""
+    objects.sort(key=lambda obj: (obj.is_building, -float(np.prod(obj.box[1] - obj.box[0])), obj.id))
     taken: set[str] = set()
     out = []
     for obj in objects:

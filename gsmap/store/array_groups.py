@@ -11,6 +11,7 @@ from gsmap.errors import CorruptError, NotFoundError
 from gsmap.store.arrays import Arrays, StagedGroup, StoredFile
 from gsmap.store.branches import OtherCatalogs
 from gsmap.store.catalog import Catalog, now
+from gsmap.store.catalog_rows import located_files
 from gsmap.store.schema import files, graphs, groups, prepared_scenes, view_features
 
 
@@ -86,5 +87,7 @@ def num_bytes(connection: Connection, group_id: str) -> int:
 
 def manifest(connection: Connection, group_id: str) -> tuple[StoredFile, ...]:
     """Return the files of a group with their digests."""
+    if (known := located_files(connection, group_id)) is not None:
+        return known
     rows = connection.execute(select(files).where(files.c.group_id == group_id).order_by(files.c.path))
     return tuple(StoredFile(r.path, r.size_bytes, r.sha256) for r in rows)

@@ -16,6 +16,7 @@ from gsmap.store import recipes
 from gsmap.store.array_groups import manifest, num_bytes, publish, unless_pruned, unname
 from gsmap.store.arrays import Arrays, digest
 from gsmap.store.catalog import Catalog, next_timestamp
+from gsmap.store.catalog_rows import located_graphs
 from gsmap.store.column_types import corrupt_value, is_direction
 from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.store.graph_content import from_arrays, shapes_of, to_arrays
@@ -124,10 +125,7 @@ class Graphs:
             NotFoundError: no such scene, or another process pruned the graph meanwhile.
         """
         with self._catalog.read() as connection:
-            query = select(graphs).where(graphs.c.scene == resolve(connection, ref))
-            if key is not None:
-                query = query.where(graphs.c.key == recipes.digest_of(key))
-            row = connection.execute(query.order_by(graphs.c.created_at.desc()).limit(1)).first()
+            row = self._row(connection, resolve(connection, ref), None if key is None else recipes.digest_of(key))
             if row is None:
                 return None
             files = manifest(connection, row.group_id)
@@ -135,6 +133,15 @@ class Graphs:
         with unless_pruned(self._catalog, row.group_id, f"the graph of scene {row.scene[:12]} was dropped or replaced"):
             arrays = self._arrays.read(KIND, row.group_id, files, only=list(shapes), shapes=shapes)
         return self._with_kept_members(from_arrays(row.scene, row.about, arrays))
+
+    def _row(self, connection: Connection, scene: str, key: str | None) -> Row[Any] | None:
+        """Return the row of the newest graph of a scene, or of the graph with a key."""
+        if (known := located_graphs(connection, scene)) is not None:
+            return next((row for row in reversed(known) if key in (None, row.key)), None)
+        query = select(graphs).where(graphs.c.scene == scene)
+        if key is not None:
+            query = query.where(graphs.c.key == key)
+        return connection.execute(query.order_by(graphs.c.created_at.desc()).limit(1)).first()
 
     def _with_whole_members(self, graph: SceneGraph) -> SceneGraph:
         """Convert segment members to rows of the whole capture; see `gsmap.store.row_index_maps`."""

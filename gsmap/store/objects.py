@@ -9,13 +9,12 @@ from __future__ import annotations
 import base64
 import re
 import zlib
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, delete, insert, select, update
+from sqlalchemy import Connection, Row, delete, func, insert, select, update
 
 from gsmap.errors import CorruptError, GsmapError, InputError, NotFoundError
 from gsmap.methods import RecipeKey
@@ -55,6 +54,11 @@ class ObjectSet:
         objects: with numbers as ids, without photographs and facts, in the frame of ``poses``.
         up: (3,) direction against gravity in that frame.
         rooms: in the level frame of ``up`` (`gsmap.geometry.directions.level_frame`), the largest first.
+        graphs: key of the graph of each capture, by scene id.
+        boxes: box (2, 3) around the segments of each capture that has some, in the frame of ``poses``.
+        views: box (2, 3) around what the cameras of a capture can observe, in the same frame, by scene id.
+        surfaces: box (2, 3) of the surface points of each capture from which rooms are found, level frame in metres.
+        told: what comparisons said of the segments, by ``OLDER:NEWER``.
     """
 
     key: str
@@ -65,6 +69,11 @@ class ObjectSet:
     objects: tuple[MapObject, ...]
     up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0, 1]))
     rooms: tuple[Room, ...] = ()
+    graphs: Mapping[str, str] = field(default_factory=dict)
+    boxes: Mapping[str, np.ndarray] = field(default_factory=dict)
+    views: Mapping[str, np.ndarray] = field(default_factory=dict)
+    surfaces: Mapping[str, np.ndarray] = field(default_factory=dict)
+    told: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +81,13 @@ class ComputedObjects:
     """The objects computed for one component, to be stored.
 
     Args:
-        made: the objects, whose ids are replaced by numbers.
-        places: boxes of each object by scene.
+        made: the objects; ids that are no numbers are replaced by numbers.
+        places: boxes by scene of each object; None for an object that keeps its number.
         key: recipe and inputs.
     """
 
     made: ObjectSet
-    places: Sequence[ObjectBoxes]
+    places: Sequence[ObjectBoxes | None]
     key: RecipeKey
 
 
@@ -117,46 +126,47 @@ class Objects:
         """
         with self._catalog.write() as connection:
             forget_sets(connection, [scene for part in parts for scene in part.made.poses])
-            found = [places for part in parts for places in part.places]
-            given = _numbers_in_use(connection)
-            numbers = match_objects(connection, found, given)
+            kept = [
+                number
+                for part in parts
+                for thing, places in zip(part.made.objects, part.places, strict=True)
+                if places is None and (number := number_of(thing.id)) is not None
+            ]
+            given = _numbers_in_use(connection).union(kept)
+            found = [places for part in parts for places in part.places if places is not None]
             when = now()
             made: list[int] = []
-            for number in numbers:
+            for number in match_objects(connection, found, given):
                 if number is None:
                     new = connection.execute(insert(objects).returning(objects.c.number), {"created_at": when})
                     number = int(new.scalar_one())
                 made.append(number)
             rest = iter(made)
-            return [
-                self._save(connection, part, list(islice(rest, len(part.places))), given.union(made), when)
-                for part in parts
-            ]
+            return [self._save(connection, part, rest, given.union(made), when) for part in parts]
 
     def _save(
-        self, connection: Connection, part: ComputedObjects, numbers: Sequence[int], given: Collection[int], when: str
+        self, connection: Connection, part: ComputedObjects, numbers: Iterator[int], given: Collection[int], when: str
     ) -> ObjectSet:
         """Store one object set.
 
         Args:
-            numbers: of its objects.
+            numbers: of its new objects, and of further ones.
             given: numbers of all objects of the map.
         """
         made = part.made
-        kept = replace(
-            made,
-            objects=tuple(replace(thing, id=f"o{number}") for thing, number in zip(made.objects, numbers, strict=True)),
-        )
-        self._update_split_objects(connection, part, set(given) - set(numbers))
-        mine = object_places.c.object.in_(numbers)
-        connection.execute(delete(object_places).where(mine, object_places.c.scene.in_(list(made.poses))))
-        rows = [
-            {"object": number, "scene": scene, "box": from_array(box)}
-            for number, places in zip(numbers, part.places, strict=True)
-            for scene, box in places.items()
+        own = [
+            thing if places is None else replace(thing, id=f"o{next(numbers)}")
+            for thing, places in zip(made.objects, part.places, strict=True)
         ]
-        if rows:
-            connection.execute(insert(object_places), rows)
+        kept = replace(made, objects=tuple(own))
+        new = {
+            number: places
+            for thing, places in zip(own, part.places, strict=True)
+            if places is not None and (number := number_of(thing.id)) is not None
+        }
+        mine = {number_of(thing.id) for thing in own}
+        self._update_split_objects(connection, part, [number for number in given if number not in mine])
+        _replace_places(connection, new, made.poses)
         value = {
             "key": part.key.digest,
             "recipe": recipes.save_recipe(connection, part.key),
@@ -173,10 +183,11 @@ class Objects:
 
         Their boxes then stay equal, so that each keeps its number, and they merge again when the components do.
         """
-        in_scenes = object_places.c.scene.in_(list(part.made.poses))
-        for row in connection.execute(select(object_places).where(in_scenes)).all():
-            if row.object in others:
-                here = np.array([places[row.scene] for places in part.places if row.scene in places])
+        new = [places for places in part.places if places is not None]
+        wanted = set(others)
+        for row in _place_rows(connection, {scene for places in new for scene in places}) if wanted else ():
+            if row.object in wanted:
+                here = np.array([places[row.scene] for places in new if row.scene in places])
                 share = _overlaps(here, np.array([row.box], np.float64)).ravel() if len(here) else np.zeros(1)
                 if share.max() >= _MIN_OVERLAP:
                     same = (object_places.c.object == row.object) & (object_places.c.scene == row.scene)
@@ -189,27 +200,26 @@ class Objects:
         with self._catalog.read() as connection:
             return match_objects(connection, places, _numbers_in_use(connection, besides=captures))
 
-    def split_objects(self, shown: Mapping[int, Iterable[str]]) -> dict[int, int]:
+    def split_objects(self, components: Mapping[int, int], scenes: Mapping[str, int]) -> dict[int, int]:
         """Return pairs of objects that were one before their component was split, as a mapping between their numbers.
 
         Args:
-            shown: captures of the object's component, by object number.
+            components: component of each object, by number.
+            scenes: component of each placed scene.
         """
-        components = {number: set(captures) for number, captures in shown.items()}
         with self._catalog.read() as connection:
             rows = connection.execute(select(object_places).order_by(object_places.c.object)).all()
-        by_scene: dict[str, list[tuple[int, np.ndarray]]] = {}
+        by_scene: dict[str, tuple[list[Row[Any]], list[Row[Any]]]] = {}
         for row in rows:
-            if row.object in components:
-                by_scene.setdefault(row.scene, []).append((row.object, np.array(row.box, np.float64)))
+            component = components.get(row.object)
+            if component is not None:
+                by_scene.setdefault(row.scene, ([], []))[scenes.get(row.scene) != component].append(row)
         out: dict[int, int] = {}
-        for scene, places in by_scene.items():
-            here = [one for one in places if scene in components[one[0]]]
-            elsewhere = [one for one in places if scene not in components[one[0]]]
+        for here, elsewhere in by_scene.values():
             if here and elsewhere:
-                share = _overlaps(np.array([box for _, box in here]), np.array([box for _, box in elsewhere]))
-                for i, j in np.argwhere(share >= _MIN_OVERLAP):
-                    out.setdefault(here[i][0], elsewhere[j][0])
+                boxes = (np.array([row.box for row in some], np.float64) for some in (here, elsewhere))
+                for i, j in np.argwhere(_overlaps(*boxes) >= _MIN_OVERLAP):
+                    out.setdefault(here[i].object, elsewhere[j].object)
         return out
 
     # --- facts -------------------------------------------------------------------------------------------------------
@@ -307,10 +317,9 @@ def match_objects(
         given: numbers of other objects, which are not assigned.
     """
     known: dict[str, list[tuple[int, np.ndarray]]] = {}
-    counts: dict[int, int] = {}
-    for row in connection.execute(select(object_places)):
+    for row in _place_rows(connection, {scene for places in found for scene in places}):
         known.setdefault(row.scene, []).append((row.object, np.array(row.box, np.float64)))
-        counts[row.object] = counts.get(row.object, 0) + 1
+    counts = _num_places(connection, {number for places in known.values() for number, _ in places})
     score: dict[tuple[int, int], float] = {}
     by_scene: dict[str, list[tuple[int, np.ndarray]]] = {}
     for i, places in enumerate(found):
@@ -332,6 +341,42 @@ def match_objects(
             numbers[i] = number
             taken.add(number)
     return numbers
+
+
+_MAX_NAMED = 500  # values that one statement names; more of them read the whole table
+
+
+def _place_rows(connection: Connection, scenes: Collection[str]) -> Sequence[Row[Any]]:
+    """Return the boxes of objects in some scenes."""
+    query = select(object_places).order_by(object_places.c.object, object_places.c.scene)
+    if len(scenes) <= _MAX_NAMED:
+        return connection.execute(query.where(object_places.c.scene.in_(sorted(scenes)))).all()
+    return [row for row in connection.execute(query) if row.scene in scenes]
+
+
+def _num_places(connection: Connection, numbers: Collection[int]) -> dict[int, int]:
+    """Return the number of boxes of each of some objects."""
+    query = select(object_places.c.object, func.count()).group_by(object_places.c.object)
+    if len(numbers) <= _MAX_NAMED:
+        query = query.where(object_places.c.object.in_(sorted(numbers)))
+    return {row[0]: row[1] for row in connection.execute(query)}
+
+
+def _replace_places(connection: Connection, places: Mapping[int, ObjectBoxes], scenes: Collection[str]) -> None:
+    """Replace the boxes of objects in some scenes; boxes in other scenes stay."""
+    numbers = sorted(places)
+    for start in range(0, len(numbers), _MAX_NAMED):
+        mine = object_places.c.object.in_(numbers[start : start + _MAX_NAMED])
+        rows = connection.execute(select(object_places).where(mine)).all()
+        connection.execute(delete(object_places).where(mine))
+        stay = [{"object": row.object, "scene": row.scene, "box": row.box} for row in rows if row.scene not in scenes]
+        new = [
+            {"object": number, "scene": scene, "box": from_array(box)}
+            for number in numbers[start : start + _MAX_NAMED]
+            for scene, box in places[number].items()
+        ]
+        if stay + new:
+            connection.execute(insert(object_places), stay + new)
 
 
 def _numbers_in_use(connection: Connection, besides: Iterable[str] = ()) -> set[int]:
@@ -449,6 +494,11 @@ def _value(made: ObjectSet) -> dict[str, Any]:
         ],
         "scenes": scenes,
         "things": [made.things.get(scene, "") for scene in scenes],
+        "graphs": [made.graphs.get(scene, "") for scene in scenes],
+        "boxes": [_box_or_none(made.boxes.get(scene)) for scene in scenes],
+        "views": [_box_or_none(made.views.get(scene)) for scene in scenes],
+        "surfaces": [_box_or_none(made.surfaces.get(scene)) for scene in scenes],
+        "told": dict(made.told),
         "objects": [
             {
                 "id": thing.id,
@@ -457,16 +507,18 @@ def _value(made: ObjectSet) -> dict[str, Any]:
                 "position": plain(thing.position),
                 "colour": plain(thing.colour),
                 "building": thing.is_building,
-                # Observations of captures that cannot see the object are not stored.
                 "sightings": [
-                    [at[s.scene], s.state, s.thing, plain(s.box), s.looked, at.get(s.asked, -1)]
+                    [at[s.scene], s.state, s.thing, _box_or_none(s.box), s.looked, at.get(s.asked, -1)]
                     for s in thing.sightings
-                    if s.state != "unseen" or s.asked
                 ],
             }
             for thing in made.objects
         ],
     }
+
+
+def _box_or_none(box: np.ndarray | None) -> list[list[float]] | None:
+    return None if box is None else box.tolist()
 
 
 def _read(row: Row[Any]) -> ObjectSet:
@@ -482,9 +534,15 @@ def _read(row: Row[Any]) -> ObjectSet:
             float(value["metres"]),
             {scene: to_pose(pose) for scene, pose in row.poses.items()},
             things,
-            tuple(_object(one, scenes, things) for one in value["objects"]),
+            _objects(value["objects"], scenes),
             _numbers(value["up"], (3,)),
             tuple(_room(one, len(value["rooms"])) for one in value["rooms"]),
+            # Sets of older releases lack what follows, and are computed again.
+            dict(zip(scenes, map(str, value.get("graphs", [""] * len(scenes))), strict=True)),
+            _boxes(scenes, value.get("boxes")),
+            _boxes(scenes, value.get("views")),
+            _boxes(scenes, value.get("surfaces")),
+            {str(pair): str(text) for pair, text in value.get("told", {}).items()},
         )
     except (GsmapError, TypeError, ValueError, KeyError, IndexError, AttributeError, zlib.error) as error:
         raise CorruptError(
@@ -494,26 +552,34 @@ def _read(row: Row[Any]) -> ObjectSet:
         ) from error
 
 
-def _object(one: Mapping[str, Any], scenes: Sequence[str], things: Mapping[str, str]) -> MapObject:
-    observations: dict[int, ObjectObservation] = {}
-    for at, state, thing, box, looked, asked in one["sightings"]:
-        if state not in OBSERVATION_STATES or not 0 <= at < len(scenes) or not -1 <= asked < len(scenes):
-            raise InputError(f"an observation with the state {state!r}", code="invalid_record")
-        corners = None if box is None else _numbers(box, (2, 3))
-        by = "" if asked < 0 else scenes[asked]
-        observations[at] = ObjectObservation(scenes[at], state, int(thing), corners, float(looked), by)
-    if number_of(str(one["id"])) is None:
-        raise InputError(f"an object with the id {one['id']!r}", code="invalid_record")
-    # Captures with unknown segments have no observations.
-    every = tuple(
-        observations.get(i, ObjectObservation(scene, "unseen", -1, None, 0.0))
-        for i, scene in enumerate(scenes)
-        if things[scene]
-    )
-    colour = _numbers(one["colour"], (3,)).astype(np.float32)
-    box, position = _numbers(one["box"], (2, 3)), _numbers(one["position"], (3,))
-    is_building = bool(one.get("building", False))
-    return MapObject(str(one["id"]), int(one["component"]), box, position, colour, every, is_building=is_building)
+def _objects(rows: Sequence[Mapping[str, Any]], scenes: Sequence[str]) -> tuple[MapObject, ...]:
+    """Read the objects of a set; numbers of all objects are converted at once, which is far faster."""
+    boxes = _numbers([one["box"] for one in rows], (len(rows), 2, 3)) if rows else np.zeros((0, 2, 3))
+    positions = _numbers([one["position"] for one in rows], (len(rows), 3)) if rows else np.zeros((0, 3))
+    colours = _numbers([one["colour"] for one in rows], (len(rows), 3)) if rows else np.zeros((0, 3))
+    shown = [box for one in rows for _, _, _, box, _, _ in one["sightings"] if box is not None]
+    corners = iter(_numbers(shown, (len(shown), 2, 3)) if shown else ())
+    out = []
+    for one, box, position, colour in zip(rows, boxes, positions, colours.astype(np.float32), strict=True):
+        if number_of(str(one["id"])) is None:
+            raise InputError(f"an object with the id {one['id']!r}", code="invalid_record")
+        observations: dict[int, ObjectObservation] = {}
+        for at, state, thing, shown_box, looked, asked in one["sightings"]:
+            if state not in OBSERVATION_STATES or not 0 <= at < len(scenes) or not -1 <= asked < len(scenes):
+                raise InputError(f"an observation with the state {state!r}", code="invalid_record")
+            own = None if shown_box is None else next(corners)
+            by = "" if asked < 0 else scenes[asked]
+            observations[at] = ObjectObservation(scenes[at], state, int(thing), own, float(looked), by)
+        every = tuple(observations[at] for at in sorted(observations))
+        component, is_building = int(one["component"]), bool(one.get("building", False))
+        out.append(MapObject(str(one["id"]), component, box, position, colour, every, is_building=is_building))
+    return tuple(out)
+
+
+def _boxes(scenes: Sequence[str], values: Sequence[Any] | None) -> dict[str, np.ndarray]:
+    """Read the boxes (2, 3) of scenes."""
+    values = values or [None] * len(scenes)
+    return {scene: _numbers(box, (2, 3)) for scene, box in zip(scenes, values, strict=True) if box is not None}
 
 
 def _room(one: Mapping[str, Any], count: int) -> Room:

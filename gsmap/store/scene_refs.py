@@ -9,6 +9,7 @@ from typing import Any
 from sqlalchemy import Connection, Row, Text, select, type_coerce
 
 from gsmap.errors import InputError, NotFoundError
+from gsmap.store.catalog_rows import located_scene
 from gsmap.store.schema import scenes
 
 
@@ -52,6 +53,8 @@ def find_living(connection: Connection, ref: str) -> Row[Any]:
 
 def find(connection: Connection, ref: str) -> Row[Any]:
     """Return the row of a referenced scene; see `Scenes.get`."""
+    if (known := located_scene(connection, ref)) is not None:
+        return known
     living = scenes.c.removed_at.is_(None)
     row = connection.execute(select(scenes).where(scenes.c.name == ref, living)).first() or by_id(connection, ref)
     if row is not None:

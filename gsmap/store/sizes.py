@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import func, select
 
-from gsmap.store.schema import files, groups, models, scenes
+from gsmap.store.schema import files, graphs, groups, models, scenes
 
 if TYPE_CHECKING:
     from gsmap.store.store import Store
@@ -45,6 +45,14 @@ def sizes(store: Store) -> list[Size]:
     if store.catalog.is_sqlite and catalog.is_file():
         found.append(Size(CATALOG, 1, catalog.stat().st_size))
     return sorted(found, key=lambda one: (-one.num_bytes, one.kind))
+
+
+def graph_sizes(store: Store) -> dict[str, int]:
+    """Return the size in bytes of the arrays of all graphs of every scene, as written, by scene id."""
+    own = select(graphs.c.scene, graphs.c.group_id).distinct().subquery()
+    query = select(own.c.scene, func.sum(files.c.size_bytes)).join(files, files.c.group_id == own.c.group_id)
+    with store.catalog.read() as connection:
+        return {scene: int(num_bytes) for scene, num_bytes in connection.execute(query.group_by(own.c.scene))}
 
 
 def scene_sizes(store: Store) -> dict[str, int]:

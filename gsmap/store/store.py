@@ -25,6 +25,7 @@ from gsmap.store.backups import Backups
 from gsmap.store.branches import Branches, MapLocation
 from gsmap.store.catalog import Catalog
 from gsmap.store.catalog_copy import empty_catalog, open_sqlite_catalog
+from gsmap.store.catalog_rows import locate_all
 from gsmap.store.changes import Changes
 from gsmap.store.error_translation import set_display_name, translate_errors
 from gsmap.store.exports import Exports
@@ -107,6 +108,10 @@ class Store:
         self.backups = Backups(catalog)
         self.leases = Leases(catalog)
         self.quarantine = Quarantine(catalog)
+
+    def located(self) -> contextlib.AbstractContextManager[None]:
+        """Look up all scenes and graphs at once, for verbs that read many of them; see `gsmap.store.catalog_rows`."""
+        return locate_all(self.catalog)
 
     @cached_property
     def view_features(self) -> ViewFeatures:

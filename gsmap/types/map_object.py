@@ -66,7 +66,8 @@ class MapObject:
         box: (2, 3) float64 box where it was last seen.
         position: (3,) float64 mean of its Gaussians there.
         colour: (3,) float32 median, CIE L*a*b* (D65).
-        sightings: observations by all placed captures of the component, oldest first.
+        sightings: observations by the captures that looked at its place, oldest first; all other
+            captures of the component did not see it.
         words: annotations.
         is_building: it is rather a part of the building, a room or debris (`gsmap.objects.building_parts`).
     """

@@ -33,6 +33,12 @@ def square(x: int) -> tuple[int, int]:
     return x * x, os.getpid()
 
 
+def threads_of(x: int) -> tuple[str, int]:
+    from gsmap.render import num_threads
+
+    return os.environ["OPENBLAS_NUM_THREADS"], num_threads()
+
+
 def die(x: int) -> int:
     os.kill(os.getpid(), signal.SIGKILL)
     return x
@@ -91,6 +97,17 @@ def test_same_results_for_one_and_many_workers() -> None:
     assert {i: v for i, (v, _) in inline.items()} == {i: v for i, (v, _) in spread.items()}
     assert {pid for _, pid in inline.values()} == {os.getpid()}
     assert os.getpid() not in {pid for _, pid in spread.values()}
+
+
+def test_workers_share_the_processors(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("gsmap.platform.num_processors", lambda: 6)
+    found = {result for _, result in run_jobs(threads_of, [(x,) for x in range(4)], Params(workers=2))}
+    assert found == {("3", 3)}
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "5")
+    found = {result for _, result in run_jobs(threads_of, [(x,) for x in range(4)], Params(workers=2))}
+    assert found == {("5", 3)}, "what the user has set stays"
 
 
 def test_a_job_that_kills_its_worker_twice_is_set_aside_and_the_rest_is_done() -> None:

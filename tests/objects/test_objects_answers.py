@@ -91,3 +91,18 @@ def test_the_graph_reads_back_as_graphml(tmp_path):
     assert [data["kind"] for _, _, data in back.edges(data=True)] == ["on"]
     assert back.nodes["vase"]["size_z"] == pytest.approx(0.3)
     assert back.nodes["vase"]["there"] is True
+
+
+def test_objects_far_from_each_other_are_not_compared_and_the_others_are():
+    rng = np.random.default_rng(3)
+    low = rng.uniform(0, 40, (300, 3)) * [1, 0.2, 0.02]
+    things = [thing(f"t{k}", at, at + rng.uniform(0.2, 1.5, 3)) for k, at in enumerate(low)]
+    every = [(r.source, r.kind, r.target) for r in relations(things)]
+    alone = [
+        (r.source, r.kind, r.target)
+        for i in range(len(things))
+        for j in range(i + 1, len(things))
+        for r in relations([things[i], things[j]])
+    ]
+    assert len(every) > 100
+    assert sorted(every) == sorted(alone)

@@ -29,8 +29,15 @@ from gsmap.change import compare
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.objects.segments import find_segments
-from gsmap.objects import RenderedViews, SegmentedScene, find_changed_segment, make_objects, render_views
-from gsmap.types import MapObject, PosedScene, Segments
+from gsmap.objects import (
+    MatchedSegments,
+    RenderedViews,
+    SegmentedScene,
+    find_changed_segment,
+    make_objects,
+    render_views,
+)
+from gsmap.types import MapObject, ObjectObservation, PosedScene, Segments
 from tools.harness import argument_parser, timed
 from tools.make.change_truth import Truth, owners
 
@@ -76,7 +83,8 @@ def score(truth: Truth, with_changes: bool) -> Counter[str]:
         return render_views(gaussians, formats.read_cameras(truth.folder / f"{capture.scene}.cameras.json"))
 
     moved, parted = _told(truth, captures) if with_changes else ([], [])
-    objects, took = timed(make_objects, captures, 0, eyes, moved=moved, parted=parted)
+    told = MatchedSegments(moved, parted)
+    objects, took = timed(make_objects, captures, 0, eyes, match=lambda scenes: told)
     counts["objects ms"] += round(1000 * took)
     _followed(counts, truth, captures, whose, objects)
     return counts
@@ -88,13 +96,14 @@ def _told(truth: Truth, captures: list[SegmentedScene]) -> tuple[list[Any], list
         PosedScene(truth.gaussians(when), truth.cameras(when), when, f"2026-01-0{i + 1}T00:00:00+00:00")
         for i, when in enumerate(truth.times[:2])
     ]
+    older, newer = captures[:2]
     moved: list[Any] = []
     parted: list[Any] = []
     for change in compare(*sides).changes:
         if change.kind in ("appeared", "disappeared", "replaced", "moved"):
-            before = 0, find_changed_segment(captures[0].segments.members, change.before)
-            after = 1, find_changed_segment(captures[1].segments.members, change.after)
-            parted += [(before, 1)] * (before[1] >= 0) + [(after, 0)] * (after[1] >= 0)
+            before = older.scene, find_changed_segment(older.segments.members, change.before)
+            after = newer.scene, find_changed_segment(newer.segments.members, change.after)
+            parted += [(before, newer.scene)] * (before[1] >= 0) + [(after, older.scene)] * (after[1] >= 0)
             moved += [(before, after)] * (change.kind == "moved" and min(before[1], after[1]) >= 0)
     return moved, parted
 
@@ -119,8 +128,11 @@ def _followed(
     objects: list[MapObject],
 ) -> None:
     before, after = ({s["id"]: s for s in truth.states(when)} for when in truth.times[:2])
-    told = [[_of(captures[i], whose[i], thing.sightings[i].thing) for i in (0, 1)] for thing in objects]
-    said = [[thing.sightings[i].state for i in (0, 1)] for thing in objects]
+    sightings = [{s.scene: s for s in thing.sightings} for thing in objects]
+    unseen = [ObjectObservation(one.scene, "unseen") for one in captures]
+    shown = [[mine.get(unseen[i].scene, unseen[i]) for i in (0, 1)] for mine in sightings]
+    told = [[_of(captures[i], whose[i], both[i].thing) for i in (0, 1)] for both in shown]
+    said = [[one.state for one in both] for both in shown]
     for piece in sorted({*before, *after}):
         shown = [int((owner == piece).sum()) for owner in whose[:2]]
         was, is_ = (s.get(piece, {}).get("present", False) for s in (before, after))

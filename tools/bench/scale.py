@@ -3,6 +3,7 @@
     python -m tools.bench.scale                               # maps of 10, 100 and 1,000 scenes
     python -m tools.bench.scale --scenes 10 100 1000 10000 --updates 100 --cache FOLDER
     python -m tools.bench.scale --scenes 10 1000 10000 --updates 0 --lookup --maps FOLDER
+    python -m tools.bench.scale --verbs                       # what every verb costs on these maps
     python -m tools.bench.scale --diagonal 4000               # only exports a street of 16 km along the diagonal
 
 The maps are filled, not made: a street on which every capture sees what its neighbours see. All rows are real (scenes,
@@ -43,7 +44,7 @@ from gsmap.export import plan_tiles
 from gsmap.geometry.rotations import exp_so3
 from gsmap.types import Cameras, Gaussians, PoseGraph, ScenePose, Sim3
 from tools.bench.spent import Spent, spent
-from tools.make.large_maps import TRIED, Filled, Pattern, filled, kept, pattern
+from tools.make.large_maps import TRIED, Filled, Pattern, filled, kept, pattern, verbs
 
 
 def main() -> None:
@@ -54,6 +55,7 @@ def main() -> None:
     )
     parser.add_argument("--tiles", nargs="+", type=int, default=[100, 1000, 10_000])
     parser.add_argument("--lookup", action="store_true", help="also let the map say which pairs to try")
+    parser.add_argument("--verbs", action="store_true", help="only what every verb costs")
     parser.add_argument("--diagonal", type=int, metavar="N", help="only export N small captures along the diagonal")
     parser.add_argument("--cache", type=Path, help="keep the two real captures here")
     parser.add_argument("--maps", type=Path, help="keep filled maps here: 10,000 scenes take minutes to fill")
@@ -68,9 +70,12 @@ def main() -> None:
         rows = []
         for num in options.scenes:
             with opened(Path(scratch) / f"{num}.gsmap", num, made, options) as one:
-                rows.append(measured(one, made, options))
+                if options.verbs:
+                    rows.append(of_verbs(one, Path(scratch) / f"{num}-verbs"))
+                else:
+                    rows.append(measured(one, made, options))
                 more = one.num_scenes - num
-            if options.updates:
+            if options.updates and not options.verbs:
                 with filled(Path(scratch) / f"{num}-at-once.gsmap", num, made) as one:
                     for _ in range(more):
                         one.add()
@@ -78,6 +83,8 @@ def main() -> None:
                     rows[-1]["catalog MB, made at once"] = one.catalog_bytes() / 1e6
             print(json.dumps({"scenes": num} | rows[-1]), flush=True)
         table(options.scenes, rows)
+        if options.verbs:
+            return
     print("plan_tiles (tiles of 10 m, reach 11 m), CPU s")
     for name, place in (("street along an axis", _straight), ("street along the diagonal", _diagonal)):
         print(
@@ -92,6 +99,26 @@ def opened(path: Path, num: int, made: Pattern, options: argparse.Namespace) -> 
     options.maps.mkdir(parents=True, exist_ok=True)
     name = f"{num}-asked" if options.lookup else f"{num}"
     return kept(options.maps / name, num, made, path, asked=options.lookup)
+
+
+def of_verbs(one: Filled, scratch: Path) -> dict[str, float]:
+    """CPU seconds, SQL statements and peak memory of every verb, with objects that are up to date but for one scene."""
+    scratch.mkdir()
+    row: dict[str, float] = {}
+    for _ in range(2):  # the frame of the first solve is not that of the later ones
+        one.add()
+        one.map.update()
+        with counted(one) as count:
+            one.map.objects()
+    row |= {f"graph, few known, {name}": value for name, value in count.items() if name != "graphs"}
+    for name, call in verbs(one, scratch).items():
+        gc.collect()
+        with counted(one) as count:
+            call()
+        row |= {f"{name}, {k}": v for k, v in count.items() if k != "graphs"}
+        print(f"  {name}: {count['CPU s']:.2f} CPU s, {count['SQL']} statements", flush=True)
+    row["peak memory MB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {name: round(float(value), 4) for name, value in row.items()}
 
 
 def measured(one: Filled, made: Pattern, options: argparse.Namespace) -> dict[str, float]:

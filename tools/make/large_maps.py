@@ -12,7 +12,7 @@ import json
 import shutil
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,9 +27,11 @@ import gsmap.map
 import gsmap.optimize
 import gsmap.register
 import gsmap.retrieve
+from gsmap.geometry.directions import rotation_to_z
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import exp
 from gsmap.map import Map
+from gsmap.map.page_source import MapPageSource
 from gsmap.map.scene_lookup import keys_of_lookups
 from gsmap.map.stages import describe, register
 from gsmap.methods import RecipeKey
@@ -42,7 +44,7 @@ from gsmap.store.chunk_boxes import get_boxes, put_boxes
 from gsmap.store.graphs import Graphs
 from gsmap.store.indexes import Lookup
 from gsmap.store.schema import files, graphs, registrations, scene_facts, scenes
-from gsmap.types import Cameras, Gaussians, NodeLayer, Registration, SceneGraph, Sim3
+from gsmap.types import Cameras, Gaussians, NodeLayer, Registration, SceneGraph, Segments, Sim3
 from gsmap.types.retrieval import Candidate
 from gsmap.types.segments import merged, to_merge
 from tools.bench.spent import spent, statements
@@ -92,11 +94,19 @@ def tiny_pattern() -> Pattern:
         embeddings=rng.normal(size=(5, 8)),
         num_views=np.ones(5, dtype=np.int64),
     )
-    graph = SceneGraph("", {"landmarks": nodes}, np.array([0, 0, 1.0]), 1.0)
+    graph = SceneGraph("", {"landmarks": nodes}, np.array([0, 0, 1.0]), 1.0, segments=_tiny_segments(rng))
     edge = Registration(
         "a", "b", "accepted", "", Sim3.identity(), np.diag(_SIGMAS**-2.0), 100, 200, 0.5, "graph:landmarks"
     )
     return Pattern(gaussians, cameras, graph, edge, Registration("a", "b", "no_match", "no pose was found"))
+
+
+def _tiny_segments(rng: np.random.Generator) -> Segments:
+    """Two segments of 32 Gaussians and 240 samples each."""
+    samples = np.concatenate([rng.uniform(0, 0.8, (240, 3)) + at for at in ([1.0, 1, 0], [-2.0, 1, 0])])
+    boxes = np.array([[part.min(0), part.max(0)] for part in np.split(samples, 2)])
+    members, colours = np.resize([0, 1], 64), np.full((480, 3), 50.0)
+    return Segments(members, boxes.mean(1), boxes, colours[:2], samples, colours, np.full(2, 240))
 
 
 def pattern(folder: Path) -> Pattern:
@@ -158,9 +168,10 @@ class Filled:
         return len(self.order)
 
     def truth(self, place: int) -> Sim3:
-        """``S_world_scene`` of a capture along the street, each in a frame of its own."""
-        rng = np.random.default_rng(place)
-        own = Sim3(exp_so3(rng.normal(size=3)), rng.normal(size=3))
+        """``S_world_scene`` of a capture along the street, each in a level frame of its own."""
+        turn, x, y = np.random.default_rng(place).normal(size=3)
+        up = np.array([0.0, 0, 1]) if self.made.graph.up is None else self.made.graph.up
+        own = Sim3(exp_so3([0, 0, turn]) @ rotation_to_z(up), [x, y, 0])
         return Sim3(exp_so3([0, 0, 0.05 * place]), [4.0 * place, 2 * np.sin(place / 5), 0]) @ own
 
     def edge(self, a: int, b: int) -> Registration:
@@ -314,6 +325,75 @@ def kept(path: Path, num: int, made: Pattern, scratch: Path, *, asked: bool = Fa
         one = Filled(m, made, order, len(order))
         with one.standing_in():
             yield one
+
+
+def verbs(one: Filled, scratch: Path) -> dict[str, Callable[[], object]]:
+    """Return calls that do what each verb does on a filled map that has objects, in an order in which all can run.
+
+    A verb that writes changes one scene, edge or object. Verbs whose work is that of their input alone (`convert`,
+    `clean`, `demo`) and verbs that read every array (`check`, `backup`) by purpose are not among them.
+
+    Args:
+        scratch: an empty folder.
+    """
+    m = one.map
+    names = m.store.scenes.names()
+    middle, first, second = (names[one.order[k]] for k in (one.num_scenes // 2, -1, -2))
+    pair = one.some_pair()
+
+    def add_and_update() -> None:
+        one.add()
+        m.update()
+
+    def remove_and_restore() -> None:
+        m.remove(second)
+        m.restore_scene(second)
+
+    def evaluate() -> None:
+        truth = scratch / "truth"
+        truth.mkdir()
+        for k, scene in enumerate(one.order[: len(names)]):
+            pose = {"T_scene_world": one.truth(k).inverse().matrix().tolist()}
+            (truth / f"{names[scene]}.json").write_text(json.dumps(pose))
+        m.evaluate(truth)
+
+    return {
+        "update, nothing new": m.update,
+        "update, one scene more": add_and_update,
+        "graph, one scene more": m.objects,
+        "graph": m.objects,
+        "history": lambda: m.history("o1"),
+        "edit OBJECT": lambda: m.edit_object("o1", name="sofa"),
+        "find --like OBJECT": lambda: m.find(like="o1"),
+        "status": m.status,
+        "list scenes": m.scene_rows,
+        "list edges": m.edge_rows,
+        "list revisions": m.revision_rows,
+        "list tiles": m.tile_rows,
+        "list photos": m.photo_rows,
+        "show SCENE": lambda: m.show_scene(middle),
+        "show A:B": lambda: m.show_pair(pair),
+        "show OBJECT": lambda: m.history("o2"),
+        "why A:B": lambda: m.why(pair),
+        "poses": m.pose_rows,
+        "measure": lambda: m.measure(f"{first}:0,0,0", f"{second}:0,0,0"),
+        "settings": m.setting_rows,
+        "changes, nothing dated": m.changes,
+        "edit SCENE": lambda: m.edit(middle, note="wet"),
+        "confirm": lambda: m.confirm(pair),
+        "reject": lambda: m.reject(pair, withdraw=True),
+        "optimize, nothing new": m.optimize,
+        "diff": lambda: m.diff(*[row.number for row in m.revision_rows()][-2:]),
+        "thin --dry-run": lambda: m.thin(keep_days=30, dry_run=True),
+        "report": lambda: m.report(scratch / "report.html", pictures=False),
+        "evaluate": evaluate,
+        "view, content": lambda: MapPageSource(m.store, m.settings).content(),
+        "branch": lambda: m.branch("other"),
+        "tag": lambda: m.tag("now"),
+        "prune --dry-run": lambda: m.prune(dry_run=True),
+        "remove, restore-scene": remove_and_restore,
+        "clone": lambda: m.clone(scratch / "clone.gsmap"),
+    }
 
 
 def _fill_index(one: Filled) -> None:

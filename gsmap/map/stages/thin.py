@@ -16,6 +16,7 @@ from gsmap.map.shared_jobs import note_interruption
 from gsmap.methods import RecipeKey
 from gsmap.reason_codes import reason, reason_code
 from gsmap.store import Store, compact
+from gsmap.store.sizes import graph_sizes, scene_sizes
 from gsmap.thin import find_visible, measure_fidelity_db, observed_fraction, render_views
 from gsmap.types import PosedScene, PoseGraph, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
@@ -68,7 +69,9 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
             f"no date lies {request.keep_days:g} days before today: pass fewer days", code="date_out_of_range"
         ) from error
     known = [scene for scene in dated if scene.id in graph.poses]
-    sizes = {scene: _num_bytes(store, scene) for scene in living}
+    of_scenes, of_graphs = scene_sizes(store), graph_sizes(store)
+    sizes = {scene: of_scenes.get(scene, 0) + of_graphs.get(scene, 0) for scene in living}
+    ups = {graph.scene: graph.up for graph in store.graphs.frames()}  # of the newest graph
     shares = _superseded(store, known, before, graph, settings, progress)
     rows: list[ThinRow] = []
     with note_interruption(lambda: f"{sum(row.thinned for row in rows)} captures are thinned"):
@@ -91,10 +94,9 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
                 continue
             after = compact.num_bytes(own.gaussians[stays])
             if not request.dry_run:
-                up = next((g.up for g in reversed(store.graphs.list()) if g.scene == scene.id), None)
                 described = store.graphs.load(scene.id)
                 with store.transaction():
-                    store.scenes.thin(scene.id, stays, up=up)
+                    store.scenes.thin(scene.id, stays, up=ups.get(scene.id))
                     _keep_things(store, described)
                 after = _num_bytes(store, scene.id)
             rows.append(_row(scene, sizes[scene.id], after, share, "", fidelity))
