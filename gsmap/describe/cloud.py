@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmap._native import local_planes as native_planes
 from gsmap.geometry.boxes import are_finite, box_around
 from gsmap.geometry.cells import cell_means
 from gsmap.geometry.colour import srgb_to_lab
@@ -55,8 +56,5 @@ def local_planes(points: np.ndarray, num_neighbours: int = 16) -> tuple[np.ndarr
     k = min(num_neighbours, len(points))
     if k < 4:
         return np.zeros((len(points), 3)), np.zeros(len(points))
-    neighbours = points[nearest_neighbours(points, k)[1]]
-    centred = neighbours - neighbours.mean(1, keepdims=True)
-    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))
-    planarity = (values[:, 1] - values[:, 0]) / np.maximum(values[:, 2], 1e-12)
-    return vectors[:, :, 0], np.clip(planarity, 0, 1)
+    normals, planarity = native_planes(points, nearest_neighbours(points, k)[1])
+    return normals, np.clip(planarity, 0, 1)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.landmarks import layer as landmarks
@@ -23,9 +25,9 @@ from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph
 from gsmap.types.model import ModelSpec
 from gsmap.types.progress import Progress, silent
 from gsmap.types.scene import SCALE_POLICIES
-from gsmap.types.views import SceneContext
+from gsmap.types.views import PointCloud, SceneContext
 
-VERSION = 5
+VERSION = 6
 _FEW_NODES = 20  # a scene gets a note if none of its layers has this many nodes
 
 
@@ -96,7 +98,8 @@ def describe(
 
     Args:
         scene_id: id that is recorded in the graph.
-        gaussians, cameras: the capture in the scene's frame; cameras may be None or synthesized.
+        gaussians, cameras: the capture in the scene's frame, of which only the view-independent colours are used;
+            cameras may be None or synthesized.
         models: checked ONNX models by kind, for the methods that need them (`gsmap.describe.onnx.check`).
         scale_policy: ``known`` (the unit is the metre: no layers at estimated units), ``unknown`` (only layers at
             estimated units), or ``auto`` (both, where a metre is plausible).
@@ -107,7 +110,7 @@ def describe(
     Raises:
         ConfigError: the policy, segmenter or embedder is unknown, or a method lacks its model.
     """
-    params = params or Params()
+    params, gaussians = params or Params(), gaussians.degree_0()
     if scale_policy not in SCALE_POLICIES:
         raise ConfigError(
             f"scale policy must be one of {', '.join(SCALE_POLICIES)}, got {scale_policy!r}", code="invalid_choice"
@@ -130,14 +133,7 @@ def describe(
             "the vertical is unknown (no cameras that turn about it, no clear floor): landmarks are matched without it"
         )
     if params.landmarks:
-        octaves = OctaveCache()
-        for i, (name, layer_unit_m) in enumerate(units.items()):
-            progress(0.05 + 0.55 * i / len(units), name)
-            layers[name] = landmark_layer(cloud, up, layer_unit_m, params.landmark, octaves)
-        if up is not None:
-            for name in [name for name in units if ":" not in name] or ["landmarks:1"]:
-                free = name.replace("landmarks", "landmarks_gravity_free")
-                layers[free] = gravity_free(layers[name], cloud, params.landmark)
+        layers |= _landmark_layers(cloud, up, units, params.landmark, progress)
     if params.objects:
         seen_m = working_m if scale_policy == "known" else guess_m
         context = SceneContext(cloud, len(gaussians), up, seen_m, models or {})
@@ -149,8 +145,23 @@ def describe(
         notes.append(f"fewer than {_FEW_NODES} nodes in every layer: too little colour or shape for registration")
     found = None
     if params.things:
-        progress(0.95, "things")
+        progress(0.95, "segments")
         found = find_segments(gaussians, cloud, up, 1.0 if "landmarks" in units else unit_m)
     progress(1.0, "described")
     graph = SceneGraph(scene_id, layers, up, unit_m, tuple(notes), found, working_m)
     return round_graph(graph)
+
+
+def _landmark_layers(
+    cloud: PointCloud, up: np.ndarray | None, units: Mapping[str, float], params: LandmarkParams, progress: Progress
+) -> dict[str, NodeLayer]:
+    """Return the landmark layers by name, at the metres per unit (`landmark_units`) that each assumes."""
+    octaves, layers = OctaveCache(), dict[str, NodeLayer]()
+    for i, (name, unit_m) in enumerate(units.items()):
+        progress(0.05 + 0.55 * i / len(units), name)
+        layers[name] = landmark_layer(cloud, up, unit_m, params, octaves)
+    if up is not None:
+        for name in [name for name in units if ":" not in name] or ["landmarks:1"]:
+            free = name.replace("landmarks", "landmarks_gravity_free")
+            layers[free] = gravity_free(layers[name], cloud, params)
+    return layers

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmap._native import points_on_surface
+
 
 def project(points: np.ndarray, T_camera_frame: np.ndarray, intrinsics_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Project points to an image.
@@ -62,12 +64,10 @@ def on_surface(
     Returns:
         The (n,) rows of the selected points, and their pixels (n, 2) int64 ``column row``.
     """
-    column, row, z = project_all(points, T_camera_frame, intrinsics_px)
-    height, width = depth.shape
-    with np.errstate(invalid="ignore"):
-        rows = np.flatnonzero((z > 1e-9) & (column >= 0) & (column < width) & (row >= 0) & (row < height))
-    pixel = np.stack([column[rows], row[rows]], axis=1).astype(np.int64)
-    surface = depth[pixel[:, 1], pixel[:, 0]]
-    rows, pixel, surface = rows[surface > 0], pixel[surface > 0], surface[surface > 0]
-    on = np.abs(z[rows] - surface) < tolerance * surface
-    return rows[on], pixel[on]
+    points = np.ascontiguousarray(points, np.float64)
+    view = np.ascontiguousarray(T_camera_frame, np.float64)
+    intrinsics = np.ascontiguousarray(intrinsics_px, np.float64)
+    found: tuple[np.ndarray, np.ndarray] = points_on_surface(
+        points, view, intrinsics, np.ascontiguousarray(depth, np.float32), tolerance
+    )
+    return found

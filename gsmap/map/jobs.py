@@ -107,7 +107,7 @@ def describe_scene(
 
     scenes = _store(path).scenes
     policy = scenes.get(scene_id).scale_policy
-    gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
+    gaussians, cameras = scenes.unread(scene_id).degree_0(), scenes.cameras(scene_id)
     graph = describing.describe(scene_id, gaussians, cameras, params, models, scale_policy=policy)
     return graph, prepare(scene_id, gaussians, cameras, graph, policy)
 
@@ -119,7 +119,7 @@ def prepare_scene(path: str, scene_id: str, graph_key: str) -> PreparedScene:
     store = _store(path)
     graph, scenes = store.graphs.load(scene_id, graph_key), store.scenes
     assert graph is not None, f"scene {scene_id} was to be prepared before it was described"
-    gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
+    gaussians, cameras = scenes.unread(scene_id).degree_0(), scenes.cameras(scene_id)
     return prepare(scene_id, gaussians, cameras, graph, scenes.get(scene_id).scale_policy)
 
 

@@ -171,28 +171,50 @@ struct Extremum {
 // Which block, of cubes of equal size, something lies in; numbers without a fraction, however far out.
 using BlockIndex = std::array<double, 3>;
 
-// Points of one block that follow each other: they come in an order in space, so runs are few.
+// Points of one block that follow each other, and the box around them in cells: they come in an order in space, so runs are
+// few.
 struct Run {
     BlockIndex block;
     std::size_t begin, end;
+    double low[3], high[3];
+
+    bool touches(const double *from, double side) const {
+        for (int k = 0; k < 3; ++k)
+            if (high[k] < from[k] || low[k] >= from[k] + side) return false;
+        return true;
+    }
 };
 
-// All points as runs, by their blocks of cells of a size.
-std::vector<Run> runs_of(const Points &points, double size, double edge) {
+// std::floor, without the call that older processors need for it.
+inline double whole_of(double v) {
+    if (!(std::abs(v) < 0x1p52)) return v;  // has no fraction
+    const double whole = double(std::int64_t(v));
+    return whole - (v < whole);
+}
+
+// All points as runs, by their blocks of cells of a size; and their coordinates in cells.
+std::vector<Run> runs_of(const Points &points, double size, double edge, Many<double> &cells) {
     std::vector<Run> runs;
+    cells.resize(3 * points.shape(0));
     for (std::size_t i = 0; i < points.shape(0); ++i) {
         BlockIndex block;
-        for (int k = 0; k < 3; ++k) block[k] = std::floor(points.data()[3 * i + k] / size / edge);
-        if (runs.empty() || runs.back().block != block) runs.push_back({block, i, i});
-        runs.back().end = i + 1;
+        double *at = &cells[3 * i];
+        for (int k = 0; k < 3; ++k) block[k] = whole_of((at[k] = points.data()[3 * i + k] / size) / edge);
+        if (runs.empty() || runs.back().block != block)
+            runs.push_back({block, i, i, {at[0], at[1], at[2]}, {at[0], at[1], at[2]}});
+        Run &run = runs.back();
+        run.end = i + 1;
+        for (int k = 0; k < 3; ++k) run.low[k] = std::min(run.low[k], at[k]), run.high[k] = std::max(run.high[k], at[k]);
     }
     std::sort(runs.begin(), runs.end(),
               [](const Run &a, const Run &b) { return std::tie(a.block, a.begin) < std::tie(b.block, b.begin); });
     return runs;
 }
 
-// The runs of a block and of those around it, in the order of their points.
-std::vector<Run> runs_near(const std::vector<Run> &runs, const BlockIndex &block, int reach) {
+// The runs that touch a block and its halo, in the order of their points.
+std::vector<Run> runs_near(const std::vector<Run> &runs, const BlockIndex &block, double edge, double halo) {
+    const int reach = int(std::ceil(halo / edge));
+    const double from[3] = {block[0] * edge - halo, block[1] * edge - halo, block[2] * edge - halo};
     std::vector<Run> near;
     for (int dx = -reach; dx <= reach; ++dx)
         for (int dy = -reach; dy <= reach; ++dy) {
@@ -201,7 +223,7 @@ std::vector<Run> runs_near(const std::vector<Run> &runs, const BlockIndex &block
                                         [](const Run &r, const BlockIndex &b) { return r.block < b; });
             for (; run != runs.end() && run->block[0] == first[0] && run->block[1] == first[1] &&
                    run->block[2] <= block[2] + reach; ++run)
-                near.push_back(*run);
+                if (run->touches(from, edge + 2 * halo)) near.push_back(*run);
         }
     std::sort(near.begin(), near.end(), [](const Run &a, const Run &b) { return a.begin < b.begin; });
     // So far out that one more is no other number, a block is its own neighbour.
@@ -217,7 +239,7 @@ struct Block {
     int shape[3] = {};
 
     // In place of what was in it, whose memory is used again.
-    void fill(const Points &all, const Points &colours, const Numbers &sizes, double size, double square,
+    void fill(const Many<double> &cells, const Points &colours, const Numbers &sizes, double square,
               const std::vector<Run> &near, const double *core, double edge, double halo) {
         double high[3] = {};
         points.clear(), lab.clear(), areas.clear();
@@ -226,9 +248,8 @@ struct Block {
         points.reserve(3 * most), lab.reserve(3 * most), areas.reserve(most);  // takes no memory until it is used
         for (const Run &run : near)
             for (std::size_t i = run.begin; i < run.end; ++i) {
-                double at[3];
+                const double *at = &cells[3 * i];
                 bool inside = true;
-                for (int k = 0; k < 3; ++k) at[k] = all.data()[3 * i + k] / size;
                 for (int k = 0; k < 3; ++k) inside &= at[k] >= core[k] - halo && at[k] < core[k] + edge + halo;
                 if (!inside) continue;
                 for (int k = 0; k < 3; ++k) {
@@ -298,26 +319,30 @@ void maximum(const Grid &g, const Field &response, const int *shape, int x, int 
     found.push_back({{mean[0] / total, mean[1] / total, mean[2] / total}, double(top) / threshold, channel, sign < 0});
 }
 
-// Cells of a block, kept from one to the next: making them anew costs as much as filling them.
+// Cells of a block, kept from one block and one call to the next: making them anew costs as much as filling them.
 struct Work {
     Field field;   // zero between blocks
     Field smooth;  // anything
     Field plane;   // anything
+    Many<double> cells;  // of points
+    Block block;
+    bool whole = true;  // no block was left half done
 
-    explicit Work(const Grid &largest) : field(largest.values()), smooth(largest.values()), plane(largest.at(largest.ny, 0)) {}
+    // Makes room for the largest block.
+    void reserve(const Grid &largest) {
+        if (!whole || field.size() < largest.values()) field = Field(), field = Field(largest.values());
+        if (smooth.size() < largest.values()) smooth = Field(), smooth = Field(largest.values());
+        if (plane.size() < largest.at(largest.ny, 0)) plane = Field(largest.at(largest.ny, 0));
+    }
 };
 
 // As large a block as any of these points, so many cells a side.
-Grid largest(const Points &points, double size, double cells) {
+Grid largest(const std::vector<Run> &runs, double cells) {
     int shape[3] = {};
     for (int k = 0; k < 3; ++k) {
-        double low = 0, high = 0;
-        for (std::size_t i = 0; i < points.shape(0); ++i) {
-            const double at = points.data()[3 * i + k];
-            low = i ? std::min(low, at) : at;
-            high = i ? std::max(high, at) : at;
-        }
-        shape[k] = int(std::min(cells, (high - low) / size)) + 9;  // see Block
+        double low = runs.empty() ? 0 : runs[0].low[k], high = low;
+        for (const Run &run : runs) low = std::min(low, run.low[k]), high = std::max(high, run.high[k]);
+        shape[k] = int(std::min(cells, high - low)) + 9;  // see Block
     }
     return Grid(shape[0], shape[1], shape[2]);
 }
@@ -327,38 +352,51 @@ void empty(const Grid &g, Field &field, const Flags &flags) {
         each(flags[row], [&](int s) { std::fill_n(&field[g.at(row, s)], Grid::WIDTH, 0.f); });
 }
 
+inline Cell &cell_of(Field &values, std::size_t cell) { return *reinterpret_cast<Cell *>(&values[cell]); }
+
+// Whether a cell, of this mass after the first blur, belongs to the surface.
+inline bool is_surface(float mass, float of_plane) { return mass * of_plane > 0.3f; }
+
+// Flags the segments that hold surface.
+WIDE void flag_surface(const Grid &g, const Field &smooth, const Flags &filled, float of_plane, Flags &surface) {
+    for (std::size_t row = 0; row < g.rows(); ++row)
+        each(filled[row], [&](int s) {
+            bool any = false;
+            for (int c = 0; c < SEGMENT; ++c) any |= is_surface(smooth[g.at(row, s) + c * CHANNELS + 3], of_plane);
+            surface[row] |= std::uint64_t(any) << s;
+        });
+}
+
+// The differences between the means of both blurs, in place of those of the second; and the excess of surface.
+WIDE void respond(const Grid &g, Field &smooth, const Flags &surface, float of_plane, Field &field) {
+    for (std::size_t row = 0; row < g.rows(); ++row)
+        each(surface[row], [&](int s) {
+            for (std::size_t cell = g.at(row, s); cell < g.at(row, s + 1); cell += CHANNELS) {
+                const float mass = smooth[cell + 3], around = field[cell + 3];
+                cell_of(field, cell) = is_surface(mass, of_plane) ? cell_of(smooth, cell) / std::max(mass, 1e-9f) -
+                                                                        cell_of(field, cell) / std::max(around, 1e-9f)
+                                                                  : Cell{};
+                field[cell + 3] = mass * of_plane - 1;
+            }
+        });
+}
+
 // See gsmap/describe/landmarks/detect.py.
 std::vector<Extremum> extrema(const Block &block, Work &work, const double *thresholds, double sigma, double surround) {
     const int *shape = block.shape;
     const Grid g(shape[0], shape[1], shape[2]);
-    auto &[field, smooth, plane] = work;
+    Field &field = work.field, &smooth = work.smooth, &plane = work.plane;
     Flags filled(g.rows(), 0), surface(g.rows(), 0);
     splat(g, block, field, filled);
     const Blur near(g, sigma, filled, nullptr);
     near(g, field, filled, plane, smooth);
     empty(g, field, filled);
     const float of_plane = float(std::sqrt(2 * 3.14159265358979323846) * sigma);
-    const auto is_surface = [&](float mass) { return mass * of_plane > 0.3f; };
-    for (std::size_t row = 0; row < g.rows(); ++row)
-        each(near.after_z[row], [&](int s) {
-            bool any = false;
-            for (int c = 0; c < SEGMENT; ++c) any |= is_surface(smooth[g.at(row, s) + c * CHANNELS + 3]);
-            surface[row] |= std::uint64_t(any) << s;
-        });
+    flag_surface(g, smooth, near.after_z, of_plane, surface);
     const Blur far(g, sigma * std::sqrt(surround * surround - 1), near.after_z, &surface);
     far(g, smooth, near.after_z, plane, field);
     Field &response = field;  // takes the place of what is around
-    const auto of = [](Field &values, std::size_t cell) -> Cell & { return *reinterpret_cast<Cell *>(&values[cell]); };
-    for (std::size_t row = 0; row < g.rows(); ++row)
-        each(surface[row], [&](int s) {
-            for (std::size_t cell = g.at(row, s); cell < g.at(row, s + 1); cell += CHANNELS) {
-                const float mass = smooth[cell + 3], around = field[cell + 3];
-                of(response, cell) = is_surface(mass) ? of(smooth, cell) / std::max(mass, 1e-9f) -
-                                                            of(field, cell) / std::max(around, 1e-9f)
-                                                      : Cell{};
-                response[cell + 3] = mass * of_plane - 1;
-            }
-        });
+    respond(g, smooth, surface, of_plane, response);
     Cell about;  // no more than the thresholds: most cells are far below
     for (int c = 0; c < CHANNELS; ++c) about[c] = std::nextafter(float(thresholds[c]), 0.f);
     const auto is_far_below = [&](const Cell &cell) {
@@ -372,7 +410,7 @@ std::vector<Extremum> extrema(const Block &block, Work &work, const double *thre
         for (int y = 0; y < g.ny; ++y)
             each(surface[g.row(x, y)], [&](int s) {
                 for (int z = s * SEGMENT; z < std::min((s + 1) * SEGMENT, shape[2]); ++z) {
-                    if (is_far_below(of(response, g.cell(x, y, z)))) continue;
+                    if (is_far_below(cell_of(response, g.cell(x, y, z)))) continue;
                     for (int c = 0; c < CHANNELS; ++c) {
                         const float value = response[g.cell(x, y, z) + c];
                         if (value > thresholds[c])
@@ -389,9 +427,11 @@ std::vector<Extremum> extrema(const Block &block, Work &work, const double *thre
 }  // namespace
 
 void bind_landmarks(nb::module_ &m) {
+    nb::class_<Work>(m, "LandmarkWorkspace", "Memory that calls of `landmark_extrema` use, one after the other.")
+        .def(nb::init<>());
     m.def(
         "landmark_extrema",
-        [](Points points, Points lab, Numbers areas, Numbers thresholds, double size, double square, double edge,
+        [](Work &work, Points points, Points lab, Numbers areas, Numbers thresholds, double size, double square, double edge,
            double halo, double sigma, double surround) {
             const std::size_t n = points.shape(0);
             if (lab.shape(0) != n || areas.shape(0) != n || thresholds.shape(0) != 4)
@@ -405,15 +445,16 @@ void bind_landmarks(nb::module_ &m) {
             std::vector<double> rows;
             {
                 nb::gil_scoped_release release;
-                Work work(largest(points, size, edge + 2 * halo));
-                Block block;
-                const std::vector<Run> runs = runs_of(points, size, edge);
+                const std::vector<Run> runs = runs_of(points, size, edge, work.cells);
+                work.reserve(largest(runs, edge + 2 * halo));
+                work.whole = false;
+                Block &block = work.block;
                 for (std::size_t r = 0; r < runs.size(); ++r) {
                     if (r && runs[r].block == runs[r - 1].block) continue;
                     double core[3];
                     for (int k = 0; k < 3; ++k) core[k] = runs[r].block[k] * edge;
-                    const auto near = runs_near(runs, runs[r].block, int(std::ceil(halo / edge)));
-                    block.fill(points, lab, areas, size, square, near, core, edge, halo);
+                    const auto near = runs_near(runs, runs[r].block, edge, halo);
+                    block.fill(work.cells, lab, areas, square, near, core, edge, halo);
                     if (block.areas.empty()) continue;
                     for (Extremum &e : extrema(block, work, thresholds.data(), sigma, surround)) {
                         bool own = true;
@@ -426,13 +467,13 @@ void bind_landmarks(nb::module_ &m) {
                                                      e.position[1], e.position[2], e.ratio});
                     }
                 }
+                work.whole = true;
             }
             const std::size_t count = rows.size() / 6;
             return numpy_of(std::move(rows), {count, 6});
         },
-        nb::arg("points"), nb::arg("lab"), nb::arg("areas"), nb::arg("thresholds"), nb::arg("size"),
-        nb::arg("square"), nb::arg("edge"),
-        nb::arg("halo"), nb::arg("sigma"), nb::arg("surround"),
+        nb::arg("work"), nb::arg("points"), nb::arg("lab"), nb::arg("areas"), nb::arg("thresholds"), nb::arg("size"),
+        nb::arg("square"), nb::arg("edge"), nb::arg("halo"), nb::arg("sigma"), nb::arg("surround"),
         "Rows (channel, negative, x, y, z, response over threshold) of the extrema within blocks of cells, each looked at "
         "with its halo: all in cells. Points and areas are in a unit of which a cell has a side of `size` and an area of\n"
         "`square`. Points that come in an order in space are faster.");

@@ -106,6 +106,34 @@ void add_colour(std::size_t pixel, int32_t point, const Hues &chroma, const Plan
 
 void bind_pictures(nb::module_ &m) {
     m.def(
+        "points_on_surface",
+        [](Points points, Pose view, Lens lens, Plane depth, double tolerance) {
+            const double *T = view.data(), fx = lens.data()[0], fy = lens.data()[1], cx = lens.data()[2], cy = lens.data()[3];
+            const int64_t height = int64_t(depth.shape(0)), width = int64_t(depth.shape(1));
+            std::vector<int64_t> rows, pixels;
+            {
+                nb::gil_scoped_release release;
+                for (std::size_t i = 0; i < points.shape(0); ++i) {
+                    const double *p = points.data() + 3 * i;
+                    const double z = T[8] * p[0] + T[9] * p[1] + T[10] * p[2] + T[11];
+                    if (!(z > 1e-9)) continue;
+                    const double column = fx * (T[0] * p[0] + T[1] * p[1] + T[2] * p[2] + T[3]) / z + cx;
+                    if (!(column >= 0 && column < double(width))) continue;
+                    const double line = fy * (T[4] * p[0] + T[5] * p[1] + T[6] * p[2] + T[7]) / z + cy;
+                    if (!(line >= 0 && line < double(height))) continue;
+                    const float surface = depth.data()[int64_t(line) * width + int64_t(column)];
+                    if (!(surface > 0) || !(std::abs(z - double(surface)) < double(float(tolerance) * surface))) continue;
+                    rows.push_back(int64_t(i));
+                    pixels.push_back(int64_t(column)), pixels.push_back(int64_t(line));
+                }
+            }
+            const std::size_t found = rows.size();
+            return std::make_tuple(numpy_of(std::move(rows), {found}), numpy_of(std::move(pixels), {found, 2}));
+        },
+        nb::arg("points"), nb::arg("T_camera_frame"), nb::arg("intrinsics"), nb::arg("depth"), nb::arg("tolerance"),
+        "Rows (n,) of the points that lie on the surface of a depth image (0 without one), within a share of its depth; and\n"
+        "their pixels (n, 2), column and row.");
+    m.def(
         "depth_ranges",
         [](Plane depth, Mask opaque) {
             same_size(depth, opaque);

@@ -2,6 +2,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
 #include <cmath>
 #include <stdexcept>
 #include <tuple>
@@ -23,6 +24,7 @@ constexpr double kOpposed = -0.5;  // cosine of two faces at which a cell is ano
 constexpr double kLeastNoise = 0.03;  // of the radius: planes that fit better than this leave colour its say
 
 using Rows = nb::ndarray<const int64_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using Neighbourhoods = nb::ndarray<const int64_t, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
 using Kept = nb::ndarray<double, nb::shape<-1, 5>, nb::c_contig, nb::device::cpu>;
 using Frame = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
 using Vector = nb::ndarray<const double, nb::shape<3>, nb::c_contig, nb::device::cpu>;
@@ -72,6 +74,44 @@ std::vector<double> normals(const PointTree &tree, int k) {
         }
     });
     return out;
+}
+
+// The plane of each point through some neighbours: unit normals, of arbitrary sign, and flatness: the difference between
+// the middle and the least spread, of the largest. Neighbours count less the farther they lie off a rough plane, where there
+// is one: exp(-d^2 / 2 width^2). Zeros are no plane.
+void planes(const double *points, const int64_t *near, int64_t n, int64_t k, const double *rough, double width,
+            double *normal, double *flat) {
+    over_blocks(n, [&](int64_t, int64_t begin, int64_t end) {
+        std::vector<double> weight(k);
+        for (int64_t i = begin; i < end; ++i) {
+            const double *at = points + 3 * i, *own = rough ? rough + 3 * i : nullptr;
+            if (own && dot(own, own) == 0) own = nullptr;
+            double mean[3] = {}, total = 0, spread[6] = {};
+            for (int64_t j = 0; j < k; ++j) {
+                const double *other = points + 3 * near[i * k + j];
+                const double d[3] = {other[0] - at[0], other[1] - at[1], other[2] - at[2]};
+                const double off = own ? dot(d, own) / width : 0;
+                weight[j] = own ? std::exp(-0.5 * off * off) + 1e-6 : 1;
+                total += weight[j];
+                for (int a = 0; a < 3; ++a) mean[a] += weight[j] * d[a];
+            }
+            for (int a = 0; a < 3; ++a) mean[a] /= total;
+            for (int64_t j = 0; j < k; ++j) {
+                const double *other = points + 3 * near[i * k + j], w = weight[j];
+                const double d[3] = {other[0] - at[0] - mean[0], other[1] - at[1] - mean[1], other[2] - at[2] - mean[2]};
+                spread[0] += w * d[0] * d[0], spread[1] += w * d[0] * d[1], spread[2] += w * d[0] * d[2];
+                spread[3] += w * d[1] * d[1], spread[4] += w * d[1] * d[2], spread[5] += w * d[2] * d[2];
+            }
+            double a[3][3] = {{spread[0], spread[1], spread[2]}, {spread[1], spread[3], spread[4]},
+                              {spread[2], spread[4], spread[5]}}, v[3][3];
+            diagonalise(a, v);
+            int order[3] = {0, 1, 2};
+            std::sort(order, order + 3, [&](int x, int y) { return a[x][x] < a[y][y] || (a[x][x] == a[y][y] && x < y); });
+            for (int c = 0; c < 3; ++c) normal[3 * i + c] = v[c][order[0]];
+            const double least = a[order[0]][order[0]], middle = a[order[1]][order[1]], most = a[order[2]][order[2]];
+            flat[i] = (middle - least) / std::max(most, 1e-12);
+        }
+    });
 }
 
 // Change of a value per metre within each point's tangent plane, by least squares over its k nearest; `ridge_m` damps it,
@@ -282,6 +322,26 @@ Equations equations(const Cells &onto, const double *points, const double *light
 }  // namespace
 
 void bind_surface(nb::module_ &m) {
+    m.def(
+        "local_planes",
+        [](Points points, Neighbourhoods near, std::optional<Points> rough, double width) {
+            const std::size_t n = points.shape(0), k = near.shape(1);
+            if (near.shape(0) != n || (rough && rough->shape(0) != n))
+                throw std::invalid_argument("points need neighbours each, and rough normals each or none");
+            if (!(width > 0)) throw std::invalid_argument("a width is positive");
+            for (std::size_t i = 0; i < n * k; ++i)
+                if (near.data()[i] < 0 || near.data()[i] >= int64_t(n)) throw std::invalid_argument("neighbours are rows");
+            std::vector<double> normal(3 * n), flat(n);
+            if (k) {
+                nb::gil_scoped_release release;
+                planes(points.data(), near.data(), int64_t(n), int64_t(k), rough ? rough->data() : nullptr, width,
+                       normal.data(), flat.data());
+            }
+            return std::make_tuple(numpy_of(std::move(normal), {n, 3}), numpy_of(std::move(flat), {n}));
+        },
+        nb::arg("points"), nb::arg("neighbours"), nb::arg("rough") = nb::none(), nb::arg("width") = 1.0,
+        "Unit normals (n, 3), of arbitrary sign, and flatness (n,) of the planes through the neighbours (n, k) of points.\n"
+        "Where a rough normal is not zero, neighbours count exp(-d^2 / 2 width^2) at a distance d from its plane.");
     nb::class_<PointTree>(m, "PointTree", "A search tree of points (n, 3).")
         .def(
             "__init__",

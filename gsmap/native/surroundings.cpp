@@ -15,7 +15,8 @@ struct Valued {
     double at[3], values[3];
 };
 
-// Points sorted into square columns of a plane, so that those near a place are found in few runs.
+// Points sorted into square columns of a plane, and by height within each, so that those near a place are found in few
+// runs.
 struct Columns {
     double low[2] = {}, size;
     int n[2] = {};
@@ -51,6 +52,16 @@ struct Columns {
             std::copy_n(points.data() + 3 * i, 3, to.at);
             std::copy_n(values.data() + 3 * i, 3, to.values);
         }
+        for (std::size_t c = 0; c + 1 < starts.size(); ++c)
+            std::stable_sort(sorted.begin() + starts[c], sorted.begin() + starts[c + 1],
+                             [](const Valued &a, const Valued &b) { return a.at[2] < b.at[2]; });
+    }
+
+    // The first point of a column above a height, or at it.
+    std::int64_t from(std::size_t column, double height) const {
+        return std::lower_bound(sorted.begin() + starts[column], sorted.begin() + starts[column + 1], height,
+                                [](const Valued &v, double z) { return v.at[2] < z; }) -
+               sorted.begin();
     }
 
     int at(double v, int axis) const {
@@ -84,22 +95,35 @@ void surroundings(const Points &positions, const Points &points, const Points &v
     const int rings = int(squares.size()), levels = std::max(int(heights.size()) - 1, 1);
     const double reach = radii.data()[rings - 1], farthest = squares.back();
     const bool upright = !heights.empty();
-    const Columns columns(points, values, reach / 4);
+    const Columns columns(points, values, reach / 6);
+    const double bottom = upright ? heights.front() : -reach, top = upright ? heights.back() : reach;
     for (std::size_t m = 0; m < positions.shape(0); ++m) {
         const double *p = positions.data() + 3 * m;
         double *sum = sums + m * rings * levels * 3, *count = counts + m * rings * levels;
-        const int x1 = columns.at(p[0] + reach, 0), y0 = columns.at(p[1] - reach, 1), y1 = columns.at(p[1] + reach, 1);
+        const int x1 = columns.at(p[0] + reach, 0);
         for (int x = columns.at(p[0] - reach, 0); x <= x1; ++x) {
-            const std::size_t row = std::size_t(x) * columns.n[1];
-            for (std::int64_t i = columns.starts[row + y0]; i < columns.starts[row + y1 + 1]; ++i) {
-                const Valued &q = columns.sorted[i];
-                const double dx = q.at[0] - p[0], dy = q.at[1] - p[1], dz = q.at[2] - p[2];
-                double distance = dx * dx + dy * dy;
-                if (!upright) distance += dz * dz;
-                if (distance > farthest || (upright && (dz <= heights.front() || dz > heights.back()))) continue;
-                const int bin = below(squares, distance) * levels + (upright ? below(heights, dz) - 1 : 0);
-                count[bin] += 1;
-                for (int c = 0; c < 3; ++c) sum[3 * bin + c] += q.values[c];
+            // The columns of this row that reach into the circle.
+            const double left = columns.low[0] + x * columns.size, right = left + columns.size;
+            const double off = x == 0 || x == columns.n[0] - 1 ? 0 : std::max({left - p[0], p[0] - right, 0.0});
+            const double half = std::sqrt(std::max(reach * reach - off * off, 0.0)) + 1e-6 * columns.size;
+            const int y1 = columns.at(p[1] + half, 1);
+            for (int y = columns.at(p[1] - half, 1); y <= y1; ++y) {
+                const std::size_t column = std::size_t(x) * columns.n[1] + y;
+                const std::int64_t end = columns.starts[column + 1];
+                const double over = p[2] + top + 1e-9 * reach;
+                int level = 0;  // rises with the points
+                for (std::int64_t i = columns.from(column, p[2] + bottom - 1e-9 * reach); i < end; ++i) {
+                    const Valued &q = columns.sorted[i];
+                    if (q.at[2] > over) break;
+                    const double dx = q.at[0] - p[0], dy = q.at[1] - p[1], dz = q.at[2] - p[2];
+                    double distance = dx * dx + dy * dy;
+                    if (!upright) distance += dz * dz;
+                    if (distance > farthest || (upright && (dz <= bottom || dz > top))) continue;
+                    while (upright && dz > heights[level + 1]) ++level;
+                    const int bin = below(squares, distance) * levels + level;
+                    count[bin] += 1;
+                    for (int c = 0; c < 3; ++c) sum[3 * bin + c] += q.values[c];
+                }
             }
         }
     }

@@ -49,7 +49,7 @@ class SceneView:
         """Preparation that all pairs of the scene share; computed unless it is known."""
         if self.known is not None:
             return self.known
-        return prepare(self.id, self.gaussians.load(), self.cameras, self.graph, self.scale_policy)
+        return prepare(self.id, self.gaussians.degree_0(), self.cameras, self.graph, self.scale_policy)
 
     @property
     def centre(self) -> np.ndarray:
@@ -84,5 +84,5 @@ class SceneView:
         held = [vars(self).get("splats"), vars(self).get("prepared", self.known)]
         for surface in self._surfaces.values():
             held += [value for value in vars(surface).values() if isinstance(value, np.ndarray)]
-            held += [surface.splats] if surface.unit_m != 1.0 else []
+            held += [vars(surface).get("splats")] if surface.unit_m != 1.0 else []
         return sum(int(getattr(one, "num_bytes", getattr(one, "nbytes", 0))) for one in held if one is not None)

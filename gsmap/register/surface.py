@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -34,33 +33,40 @@ MIN_FLOATER_COLOUR = 0.3  # a point whose colour (RGB in [0, 1]) differs by this
 RESOLUTION_M = 0.05  # points are averaged over cells of this size before they are aligned
 
 
-@dataclass(frozen=True, eq=False)
 class Surface:
-    """Centres of a scene's surface Gaussians, in metres.
+    """Centres of a scene's surface Gaussians, in metres. Every array is computed on first use.
 
     Args:
-        points: (N, 3) float64 in the scene's frame, scaled to metres.
-        colours: (N, 3) float32 view-independent colours, RGB in [0, 1].
+        points: (N, 3) float64 in the scene's frame, scaled to metres; None to compute them from ``raw``.
+        colours: (N, 3) float32 view-independent colours, RGB in [0, 1]; None as well.
         resolution_m: cell size of the aligned cloud.
-        splats: the N Gaussians in metres, with their mean colour alone; None where only points are known.
+        raw: the N Gaussians in the scene's unit, with their mean colour alone; None where only points are known.
         unit_m: metres per unit of the scene.
         gaussians, cameras: the whole scene in its own unit; None where only points are known.
         views: views of the scene through its cameras, which orient its normals; None without cameras.
         prepared: the cells of this surface, if they were computed before.
     """
 
-    points: np.ndarray
-    colours: np.ndarray
-    resolution_m: float
-    splats: Gaussians | None = None
-    unit_m: float = 1.0
-    gaussians: Gaussians | None = None
-    cameras: Cameras | None = None
-    views: ViewCache | None = None
-    prepared: PreparedScene | None = None
+    def __init__(
+        self,
+        points: np.ndarray | None,
+        colours: np.ndarray | None,
+        resolution_m: float,
+        *,
+        raw: Gaussians | None = None,
+        unit_m: float = 1.0,
+        gaussians: Gaussians | None = None,
+        cameras: Cameras | None = None,
+        views: ViewCache | None = None,
+        prepared: PreparedScene | None = None,
+    ) -> None:
+        if points is not None and colours is not None:
+            self.points, self.colours = points, colours
+        self.resolution_m, self.unit_m, self._raw = resolution_m, unit_m, raw
+        self.gaussians, self.cameras, self.views, self.prepared = gaussians, cameras, views, prepared
 
     def __len__(self) -> int:
-        return len(self.points)
+        return len(self.points) if self._raw is None else len(self._raw)
 
     @classmethod
     def of(
@@ -84,13 +90,32 @@ class Surface:
         views: ViewCache | None = None,
         prepared: PreparedScene | None = None,
     ) -> Surface:
-        """Scale the surface Gaussians of a scene, with their mean colour alone, to metres."""
-        points = splats.means.astype(np.float64) * unit_m
-        colours = np.clip(rgb_of_sh0(splats.sh[:, 0]), 0.0, 1.0)
-        if unit_m != 1.0:
-            log_scales = splats.log_scales + np.float32(np.log(unit_m))
-            splats = Gaussians(points, splats.quats, log_scales, splats.logit_opacities, splats.sh)
-        return cls(points, colours, RESOLUTION_M, splats, unit_m, gaussians, cameras, views, prepared)
+        """Return the surface of Gaussians in the scene's unit, with their mean colour alone."""
+        known = {"gaussians": gaussians, "cameras": cameras, "views": views, "prepared": prepared}
+        return cls(None, None, RESOLUTION_M, raw=splats, unit_m=unit_m, **known)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """(N, 3) float64 centres in the scene's frame, scaled to metres."""
+        assert self._raw is not None
+        return self._raw.means.astype(np.float64) * self.unit_m
+
+    @cached_property
+    def colours(self) -> np.ndarray:
+        """(N, 3) float32 view-independent colours, RGB in [0, 1]."""
+        assert self._raw is not None
+        colours: np.ndarray = np.clip(rgb_of_sh0(self._raw.sh[:, 0]), 0.0, 1.0)
+        return colours
+
+    @cached_property
+    def splats(self) -> Gaussians | None:
+        """The N Gaussians in metres, with their mean colour alone; None where only points are known."""
+        raw = self._raw
+        if raw is None or self.unit_m == 1.0:
+            return raw
+        log_scales = raw.log_scales + np.float32(np.log(self.unit_m))
+        means = raw.means.astype(np.float64) * self.unit_m
+        return Gaussians(means, raw.quats, log_scales, raw.logit_opacities, raw.sh)
 
     def scaled(self, factor: float) -> Surface:
         """Multiply all coordinates by ``factor``: convert the surface to a unit that is ``factor`` times smaller."""

@@ -13,7 +13,7 @@ from gsmap.describe import Params, describe
 from gsmap.describe.cloud import downsample, surface_cloud
 from gsmap.describe.landmarks import detect
 from gsmap.describe.landmarks.context import CELL_M, HEIGHTS_M, RADII_M, SHELLS_M, cylinder_context, shell_context
-from gsmap.describe.landmarks.detect import find_blobs, thin_cloud
+from gsmap.describe.landmarks.detect import find_blobs
 
 
 @pytest.fixture(scope="module")
@@ -92,19 +92,6 @@ def test_blocks_find_what_one_grid_finds(cloud, monkeypatch):
     assert len(whole) > 100
     distance = np.linalg.norm(whole.positions[:, None] - parts.positions[None], axis=2).min(1)
     assert (distance < 0.01).mean() > 0.95
-
-
-def test_a_thinned_cloud_has_its_surface_and_its_landmarks(cloud, monkeypatch):
-    monkeypatch.setattr(detect, "_MANY", 1000)
-    points, lab, areas = thin_cloud(cloud.points, cloud.lab, cloud.areas, 0.5)
-    assert len(points) < 0.7 * len(cloud)
-    assert areas.sum() == pytest.approx(cloud.areas.sum())
-    np.testing.assert_allclose((areas[:, None] * lab).sum(0), (cloud.areas[:, None] * cloud.lab).sum(0), rtol=1e-6)
-    few = find_blobs(cloud.points, cloud.lab, cloud.areas)
-    monkeypatch.setattr(detect, "_MANY", 10**9)
-    all_ = find_blobs(cloud.points, cloud.lab, cloud.areas)
-    distance = np.linalg.norm(all_.positions[:, None] - few.positions[None], axis=2).min(1)
-    assert np.median(distance) < 0.01
 
 
 def test_surroundings_are_the_means_of_what_lies_in_each_ring(cloud):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsmap.geometry.projection import in_image, project, project_all
+from gsmap.geometry.projection import in_image, on_surface, project, project_all
 
 INTRINSICS = np.array([100.0, 200.0, 32.0, 24.0])
 
@@ -55,3 +55,22 @@ def test_many_images_at_once_are_as_each_by_itself():
         pixels, z = project(points, poses[c], intrinsics[c])
         np.testing.assert_array_equal(np.stack([column[c], row[c]], axis=1), pixels)
         np.testing.assert_array_equal(depth[c], z)
+
+
+@pytest.mark.parametrize("tolerance", [0.05, np.inf])
+def test_points_on_a_surface_are_those_at_the_depth_of_their_pixel(tolerance):
+    rng = np.random.default_rng(2)
+    points = rng.uniform(-2, 2, (4000, 3))
+    view = np.eye(4)
+    view[:3, 3] = 0.1, -0.2, 1.5
+    intrinsics, depth = np.array([30.0, 35.0, 16.5, 11.0]), rng.uniform(0.5, 3, (24, 32)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.3] = 0
+    pixels, z = project(points, view, intrinsics)
+    inside = np.flatnonzero(in_image(pixels, z, np.array([32, 24])))
+    column, row = np.floor(pixels[inside]).astype(int).T
+    at = depth[row, column]
+    on = (at > 0) & (np.abs(z[inside] - at) < tolerance * at)
+    rows, found = on_surface(points, view, intrinsics, depth, tolerance)
+    assert 20 < on.sum() < len(inside)
+    np.testing.assert_array_equal(rows, inside[on])
+    np.testing.assert_array_equal(found, np.stack([column, row], 1)[on])

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.geometry.cells import cell_means
+from gsmap._native import LandmarkWorkspace, landmark_extrema
 from gsmap.geometry.neighbours import spatial_order
 from gsmap.types.views import PointCloud
 
@@ -24,8 +24,6 @@ _MAX_SPACING_CELLS = 1.4  # an octave is skipped if points are typically farther
 _THRESHOLDS = np.array([1.3 * 2.0, 2.0, 2.0, 0.6])
 _SIGMA_CELLS = 1.6  # blob scale in cells of its octave's grid
 _SURROUND = 1.8  # scale of the surround relative to the blob's scale
-_MANY = 400_000  # a cloud with more points is thinned to the resolution of each grid
-_THIN_CELLS = 0.3  # edge, in cells, of the cubes whose points are merged: a fifth of a blob's scale
 _ORDER_ACROSS = 256  # cells across in the order in which points are spread over grids
 _HALO_CELLS = 12  # reach of the surround's kernel and of the maxima
 _BLOCK_CELLS = 192  # grids larger than this are processed in blocks, which bounds memory
@@ -60,6 +58,7 @@ class OctaveCache:
     def __init__(self) -> None:
         self._levelled: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self._found: dict[object, list[tuple[int, int, np.ndarray, np.ndarray]]] = {}
+        self._work = LandmarkWorkspace()
 
     def levelled(self, cloud: PointCloud, level: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return points, L*a*b* and areas of the cloud, rotated by ``level`` (3, 3), in spatial order, which is
@@ -83,18 +82,8 @@ class OctaveCache:
         """Compute `_extrema` of a grid with cells of ``size_m``; ``unit_m`` is metres per unit of the points."""
         key = size_m / unit_m, thresholds.tobytes()
         if key not in self._found:
-            self._found[key] = list(_extrema(points, lab, areas, thresholds, size_m))
+            self._found[key] = list(_extrema(points, lab, areas, thresholds, size_m, self._work))
         return self._found[key]
-
-
-def thin_cloud(
-    points: np.ndarray, lab: np.ndarray, areas: np.ndarray, size_m: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Thin a very large cloud to the means of grid cells that are finer than a grid of ``size_m`` resolves; the area is
-    kept."""
-    if len(points) <= _MANY:
-        return points, lab, areas
-    return cell_means(points, lab, size_m * _THIN_CELLS, areas)
 
 
 def find_blobs(
@@ -104,8 +93,6 @@ def find_blobs(
     max_per_octave: int = MAX_PER_OCTAVE,
     octaves: OctaveCache | None = None,
     unit_m: float = 1.0,
-    median_area_m2: float | None = None,
-    thinned_m: float = 0.0,
 ) -> Blobs:
     """Detect extrema of colour and density relative to their surround, at 1.6 cells and one scale per octave.
 
@@ -120,18 +107,14 @@ def find_blobs(
         points, lab, areas: (N, 3) points of the levelled cloud in metres, (N, 3) L*a*b*, and (N,) areas in square
             metres.
         octaves: cache of this cloud in its own unit; ``unit_m`` is metres per that unit.
-        median_area_m2: median area of the points before thinning.
-        thinned_m: cell size of the grid for which the points were thinned.
     """
     known = octaves or OctaveCache()
-    spacing_m = np.sqrt(8 / np.pi * (np.median(areas) if median_area_m2 is None else median_area_m2))
+    spacing_m = np.sqrt(8 / np.pi * np.median(areas))
     found = [_empty()]
     for octave in range(NUM_OCTAVES):
         size_m = CELL_M * 2**octave
         if spacing_m > _MAX_SPACING_CELLS * size_m:
             continue
-        if size_m > thinned_m:
-            points, lab, areas = thin_cloud(points, lab, areas, size_m)
         parts = [_empty()]
         for channel, negative, cells, ratio in known.extrema(points, lab, areas, _THRESHOLDS, size_m, unit_m):
             kind = np.full(len(cells), (channel * 2 + negative) * NUM_OCTAVES + octave, np.int32)
@@ -153,13 +136,17 @@ def _strongest(parts: list[Blobs], count: int | None = None) -> Blobs:
 
 
 def _extrema(
-    points: np.ndarray, lab: np.ndarray, areas: np.ndarray, thresholds: np.ndarray, size: float = 1.0
+    points: np.ndarray,
+    lab: np.ndarray,
+    areas: np.ndarray,
+    thresholds: np.ndarray,
+    size: float = 1.0,
+    work: LandmarkWorkspace | None = None,
 ) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
     """Yield channel, sign (1 for negative), positions (n, 3) in cells of ``size``, and responses (n,) in multiples of
     the threshold."""
-    from gsmap import _native
-
-    table = _native.landmark_extrema(
+    table = landmark_extrema(
+        work=LandmarkWorkspace() if work is None else work,
         points=np.ascontiguousarray(points, np.float64),
         lab=np.ascontiguousarray(lab, np.float64),
         areas=np.ascontiguousarray(areas, np.float64),

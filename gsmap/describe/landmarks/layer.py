@@ -15,14 +15,14 @@ from gsmap.describe.landmarks.context import (
     metric_digest,
     shell_context,
 )
-from gsmap.describe.landmarks.detect import CELL_M, MAX_PER_OCTAVE, OctaveCache, find_blobs, thin_cloud
+from gsmap.describe.landmarks.detect import MAX_PER_OCTAVE, OctaveCache, find_blobs
 from gsmap.geometry.directions import level_frame
 from gsmap.methods import RecipeKey
 from gsmap.types import NodeLayer
 from gsmap.types.plain import plain
 from gsmap.types.views import PointCloud
 
-VERSION = 7
+VERSION = 8
 
 
 @dataclass(frozen=True)
@@ -89,9 +89,8 @@ def landmark_layer(
     level = np.eye(3) if up is None else level_frame(up)
     octaves = octaves or OctaveCache()
     points, lab, areas = octaves.levelled(cloud, level)
-    spacing_m2 = float(np.median(areas)) * unit_m**2
-    points, lab, areas = thin_cloud(points * unit_m, lab, areas * unit_m**2, CELL_M)
-    blobs = find_blobs(points, lab, areas, params.max_per_octave, octaves, unit_m, spacing_m2, CELL_M)
+    points, areas = points * unit_m, areas * unit_m**2
+    blobs = find_blobs(points, lab, areas, params.max_per_octave, octaves, unit_m)
     if len(blobs) == 0:
         return NodeLayer.empty(descriptor, dim, unit_m)
     around = surroundings(blobs.positions, points, lab)

@@ -21,7 +21,7 @@ from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 from gsmap.types.views import SceneContext
 
-VERSION = 3
+VERSION = 4
 _NEAR_M = 0.1  # a view that is mostly nearer than this is inside an object and left out
 _MIN_POINTS = 12  # masks with fewer Gaussians are dropped
 _MIN_SIMILARITY = 1.1  # a region joins a node if cosine + GIoU is larger (Graph-GSReg, tau_asso)

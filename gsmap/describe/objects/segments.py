@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmap._native import local_planes as native_planes
 from gsmap.describe.objects.structure import Structure, components, find_structure
 from gsmap.geometry.boxes import are_finite, box_around
 from gsmap.geometry.cells import cell_labels, group_means
@@ -20,7 +21,7 @@ from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.types import Gaussians, Segments
 from gsmap.types.views import PointCloud
 
-VERSION = 1
+VERSION = 2
 
 _NEIGHBOURS = 12
 _SAMPLE_M = 0.08  # edge of the cells of a segment's samples, finer than the cells in which captures are compared
@@ -32,7 +33,7 @@ _SOLE_M = 0.14  # only trims and door frames reach lower than this; hanging obje
 _LINKED = 8  # of these, the neighbours that may be in the same segment
 
 
-_MAX_POINTS = 150_000  # the surface is thinned to about this many points points
+_MAX_POINTS = 150_000  # the surface is thinned to about this many points
 _LINK = 2.2  # neighbours may be in one segment up to this many times their spacing apart,
 _LINK_MIN_M = 0.04  # always up to this distance,
 _LINK_MAX_M = 0.12  # and never farther than this
@@ -45,6 +46,7 @@ _CORE = 0.65  # a core point of a patch has this share of its neighbours on the 
 _STANDS_FREE = 0.2  # largest share of a hanging patch's rim that leads to objects in front of the wall
 _MIN_POINTS = 20  # segments with fewer surface points are dropped
 _MIN_AREA_M2 = 0.03  # smaller hanging segments are dropped
+_PLANE_M = 0.025  # neighbours at this distance from a Gaussian's plane count 0.6 for its normal
 _ASSIGN_M = 0.06  # Gaussians off the surface join the segment of the nearest surface within this distance
 
 
@@ -137,18 +139,10 @@ def _normals(
     shortest = np.argmin(scales, axis=1)
     own = quats_to_matrices(gaussians.quats[index])[np.arange(len(index)), :, shortest] @ level.T
     ordered = np.sort(scales, axis=1)
-    step = points[neighbours] - points[:, None]
-
-    def axes(step: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        centred = step - ((weight[..., None] * step).sum(1) / weight.sum(1)[:, None])[:, None]
-        values, vectors = np.linalg.eigh((weight[..., None] * centred).transpose(0, 2, 1) @ centred)
-        return vectors[:, :, 0], (values[:, 1] - values[:, 0]) / np.maximum(values[:, 2], 1e-12)
-
-    rough = own
-    others = np.flatnonzero(~(ordered[:, 0] < 0.5 * ordered[:, 1]))
-    rough[others] = axes(step[others], np.ones((len(others), neighbours.shape[1])))[0]
-    off = (step @ rough[..., None])[..., 0]
-    return axes(step, np.exp(-0.5 * (off / 0.025) ** 2) + 1e-6)
+    is_flat = ordered[:, 0] < 0.5 * ordered[:, 1]
+    rough = np.where(is_flat[:, None], own, native_planes(points, neighbours)[0])
+    normals, planarity = native_planes(points, neighbours, rough, _PLANE_M)
+    return normals, planarity
 
 
 class _Surface:

@@ -16,7 +16,7 @@ from gsmap.describe.cloud import downsample, local_planes
 from gsmap.geometry.neighbours import nearest_neighbours, nearest_of
 from gsmap.types.views import Mask, PointCloud, SceneContext, View
 
-VERSION = 1
+VERSION = 2
 MODELS: tuple[str, ...] = ()
 _NUM_SAMPLES = 20000  # the surface is thinned to about this many points before it is cut
 _MIN_SHARE = 0.001  # parts with a smaller share of the samples join their most similar neighbour

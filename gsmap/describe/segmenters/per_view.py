@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from gsmap.describe.segmenters import builtin
 from gsmap.types.views import Mask, SceneContext, View
 
-VERSION = 1
+VERSION = 2
 MODELS: tuple[str, ...] = ()
 
 
