@@ -12,7 +12,7 @@ from gsmap.describe.gravity import estimate_up
 from gsmap.describe.landmarks import layer as landmarks
 from gsmap.describe.landmarks.detect import OctaveCache
 from gsmap.describe.landmarks.layer import Params as LandmarkParams
-from gsmap.describe.landmarks.layer import gravity_free, landmark_layer
+from gsmap.describe.landmarks.layer import find_extrema, gravity_free, landmark_layer
 from gsmap.describe.objects import segments
 from gsmap.describe.objects.layer import Params as ObjectParams
 from gsmap.describe.objects.layer import choose_methods, object_layer
@@ -157,6 +157,7 @@ def _landmark_layers(
 ) -> dict[str, NodeLayer]:
     """Return the landmark layers by name, at the metres per unit (`landmark_units`) that each assumes."""
     octaves, layers = OctaveCache(), dict[str, NodeLayer]()
+    find_extrema(cloud, up, units.values(), params, octaves)
     for i, (name, unit_m) in enumerate(units.items()):
         progress(0.05 + 0.55 * i / len(units), name)
         layers[name] = landmark_layer(cloud, up, unit_m, params, octaves)

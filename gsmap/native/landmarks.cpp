@@ -15,6 +15,8 @@
 namespace gsmap {
 namespace {
 
+using Colours = nb::ndarray<const float, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+
 constexpr int CHANNELS = 4;  // L*, a*, b* and surface, side by side in memory: one walk over the grid does them all
 constexpr int SEGMENT = 4;   // cells along the last axis that are worked on, or left out, together
 constexpr int ROOM = 16;     // rows have so many cells, or a multiple; what is blurred beyond their ends is lost
@@ -239,7 +241,7 @@ struct Block {
     int shape[3] = {};
 
     // In place of what was in it, whose memory is used again.
-    void fill(const Many<double> &cells, const Points &colours, const Numbers &sizes, double square,
+    void fill(const Many<double> &cells, const Colours &colours, const Numbers &sizes, double square,
               const std::vector<Run> &near, const double *core, double edge, double halo) {
         double high[3] = {};
         points.clear(), lab.clear(), areas.clear();
@@ -431,7 +433,7 @@ void bind_landmarks(nb::module_ &m) {
         .def(nb::init<>());
     m.def(
         "landmark_extrema",
-        [](Work &work, Points points, Points lab, Numbers areas, Numbers thresholds, double size, double square, double edge,
+        [](Work &work, Points points, Colours lab, Numbers areas, Numbers thresholds, double size, double square, double edge,
            double halo, double sigma, double surround) {
             const std::size_t n = points.shape(0);
             if (lab.shape(0) != n || areas.shape(0) != n || thresholds.shape(0) != 4)

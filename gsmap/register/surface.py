@@ -91,8 +91,17 @@ class Surface:
         prepared: PreparedScene | None = None,
     ) -> Surface:
         """Return the surface of Gaussians in the scene's unit, with their mean colour alone."""
-        known = {"gaussians": gaussians, "cameras": cameras, "views": views, "prepared": prepared}
-        return cls(None, None, RESOLUTION_M, raw=splats, unit_m=unit_m, **known)
+        return cls(
+            None,
+            None,
+            RESOLUTION_M,
+            raw=splats,
+            unit_m=unit_m,
+            gaussians=gaussians,
+            cameras=cameras,
+            views=views,
+            prepared=prepared,
+        )
 
     @cached_property
     def points(self) -> np.ndarray:

@@ -28,7 +28,7 @@ _OCCUPANCY_WEIGHT = 0.75  # of a bin's occupancy in the embedding
 _COLOUR_WEIGHT = 0.7  # of a bin's colour in the embedding
 
 
-def cylinder_context(positions: np.ndarray, points: np.ndarray, lab: np.ndarray) -> np.ndarray:
+def cylinder_context(positions: np.ndarray, points: np.ndarray, lab: np.ndarray, unit_m: float = 1.0) -> np.ndarray:
     """Compute contexts (M, NUM_RINGS, 4): the mean L, a, b (standardized) and the occupancy of each ring and height.
 
     Rings have no direction, so the context is invariant to rotation about gravity. The occupancy of a bin is its number
@@ -37,6 +37,7 @@ def cylinder_context(positions: np.ndarray, points: np.ndarray, lab: np.ndarray)
     Args:
         positions: (M, 3) positions of the landmarks in the levelled frame (z up), metres.
         points, lab: (N, 3) points of the levelled cloud and their L*a*b*.
+        unit_m: metres per unit of the points.
     """
     radius, height = RADII_M, HEIGHTS_M
     levels = len(height) - 1
@@ -46,28 +47,30 @@ def cylinder_context(positions: np.ndarray, points: np.ndarray, lab: np.ndarray)
     floor = np.pi * (radius**2 - inner**2)[:, None] * np.ones(levels)[None]
 
     expected = np.minimum(wall, floor).ravel()
-    return _context(positions, points, lab, radius, height, expected)
+    return _context(positions, points, lab, unit_m, radius, height, expected)
 
 
-def shell_context(positions: np.ndarray, points: np.ndarray, lab: np.ndarray) -> np.ndarray:
+def shell_context(positions: np.ndarray, points: np.ndarray, lab: np.ndarray, unit_m: float = 1.0) -> np.ndarray:
     """Compute contexts (M, NUM_SHELLS, 4) in spherical shells, which are invariant to rotation, for scenes of unknown
     vertical.
 
     Args:
         positions: (M, 3) positions of the landmarks in any frame, metres.
         points, lab: (N, 3) points of the cloud in that frame and their L*a*b*.
+        unit_m: metres per unit of the points.
     """
     radius = SHELLS_M
     inner = np.concatenate([[0], radius[:-1]])
 
     expected = np.pi * (radius**2 - inner**2)
-    return _context(positions, points, lab, radius, np.zeros(0), expected)
+    return _context(positions, points, lab, unit_m, radius, np.zeros(0), expected)
 
 
 def _context(
     positions: np.ndarray,
     points: np.ndarray,
     lab: np.ndarray,
+    unit_m: float,
     radii_m: np.ndarray,
     heights_m: np.ndarray,
     expected_m2: np.ndarray,
@@ -75,11 +78,11 @@ def _context(
     """Compute mean colour and occupancy (M, B, 4) of rings and heights, or of shells if there are no heights."""
     from gsmap import _native
 
-    thin, colour = downsample(points, lab, CELL_M)
+    thin, colour = downsample(points, lab, CELL_M / unit_m)
     values = (colour - _LAB_CENTRE) / _LAB_SPREAD
     sums, counts = _native.landmark_surroundings(
         positions=np.ascontiguousarray(positions, np.float64),
-        points=np.ascontiguousarray(thin),
+        points=np.ascontiguousarray(thin * unit_m),
         values=np.ascontiguousarray(values),
         radii=radii_m,
         heights=heights_m,

@@ -58,7 +58,7 @@ class OctaveCache:
     def __init__(self) -> None:
         self._levelled: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self._found: dict[object, list[tuple[int, int, np.ndarray, np.ndarray]]] = {}
-        self._work = LandmarkWorkspace()
+        self._work: LandmarkWorkspace | None = None
 
     def levelled(self, cloud: PointCloud, level: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return points, L*a*b* and areas of the cloud, rotated by ``level`` (3, 3), in spatial order, which is
@@ -66,24 +66,22 @@ class OctaveCache:
         if self._levelled is None:
             points = cloud.points @ level.T
             order = spatial_order(points, _ORDER_ACROSS)
-            lab = cloud.lab.take(order, axis=0).astype(np.float64)  # converted once to the type that kernels need
-            self._levelled = points.take(order, axis=0), lab, cloud.areas[order]
+            self._levelled = points.take(order, axis=0), cloud.lab.take(order, axis=0), cloud.areas[order]
         return self._levelled
 
     def extrema(
-        self,
-        points: np.ndarray,
-        lab: np.ndarray,
-        areas: np.ndarray,
-        thresholds: np.ndarray,
-        size_m: float,
-        unit_m: float,
+        self, points: np.ndarray, lab: np.ndarray, areas: np.ndarray, thresholds: np.ndarray, size: float
     ) -> list[tuple[int, int, np.ndarray, np.ndarray]]:
-        """Compute `_extrema` of a grid with cells of ``size_m``; ``unit_m`` is metres per unit of the points."""
-        key = size_m / unit_m, thresholds.tobytes()
+        """Compute `_extrema` of a grid with cells of ``size``, in the unit of the points."""
+        key = size, thresholds.tobytes()
         if key not in self._found:
-            self._found[key] = list(_extrema(points, lab, areas, thresholds, size_m, self._work))
+            self._work = self._work or LandmarkWorkspace()
+            self._found[key] = list(_extrema(points, lab, areas, thresholds, size, self._work))
         return self._found[key]
+
+    def free_workspace(self) -> None:
+        """Free the memory of grids, when those of all layers were computed."""
+        self._work = None
 
 
 def find_blobs(
@@ -104,19 +102,19 @@ def find_blobs(
     skipped.
 
     Args:
-        points, lab, areas: (N, 3) points of the levelled cloud in metres, (N, 3) L*a*b*, and (N,) areas in square
-            metres.
-        octaves: cache of this cloud in its own unit; ``unit_m`` is metres per that unit.
+        points, lab, areas: (N, 3) points of the levelled cloud, (N, 3) L*a*b*, and (N,) areas, in the cloud's unit.
+        octaves: cache of this cloud.
+        unit_m: metres per unit of the cloud.
     """
     known = octaves or OctaveCache()
-    spacing_m = np.sqrt(8 / np.pi * np.median(areas))
+    spacing_m = np.sqrt(8 / np.pi * np.median(areas)) * unit_m
     found = [_empty()]
     for octave in range(NUM_OCTAVES):
         size_m = CELL_M * 2**octave
         if spacing_m > _MAX_SPACING_CELLS * size_m:
             continue
         parts = [_empty()]
-        for channel, negative, cells, ratio in known.extrema(points, lab, areas, _THRESHOLDS, size_m, unit_m):
+        for channel, negative, cells, ratio in known.extrema(points, lab, areas, _THRESHOLDS, size_m / unit_m):
             kind = np.full(len(cells), (channel * 2 + negative) * NUM_OCTAVES + octave, np.int32)
             parts.append(Blobs(cells * size_m, kind, ratio, np.full(len(cells), _SIGMA_CELLS * size_m)))
         found.append(_strongest(parts, max_per_octave))
@@ -148,7 +146,7 @@ def _extrema(
     table = landmark_extrema(
         work=LandmarkWorkspace() if work is None else work,
         points=np.ascontiguousarray(points, np.float64),
-        lab=np.ascontiguousarray(lab, np.float64),
+        lab=np.ascontiguousarray(lab, np.float32),
         areas=np.ascontiguousarray(areas, np.float64),
         thresholds=thresholds,
         size=size,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -89,11 +90,10 @@ def landmark_layer(
     level = np.eye(3) if up is None else level_frame(up)
     octaves = octaves or OctaveCache()
     points, lab, areas = octaves.levelled(cloud, level)
-    points, areas = points * unit_m, areas * unit_m**2
     blobs = find_blobs(points, lab, areas, params.max_per_octave, octaves, unit_m)
     if len(blobs) == 0:
         return NodeLayer.empty(descriptor, dim, unit_m)
-    around = surroundings(blobs.positions, points, lab)
+    around = surroundings(blobs.positions, points, lab, unit_m)
     positions = blobs.positions @ level / unit_m
     half = (1.5 * blobs.sigmas_m / unit_m)[:, None]
     return NodeLayer(
@@ -109,6 +109,17 @@ def landmark_layer(
     )
 
 
+def find_extrema(
+    cloud: PointCloud, up: np.ndarray | None, units_m: Iterable[float], params: Params, octaves: OctaveCache
+) -> None:
+    """Compute the extrema of the layers of a cloud at several units, and free the memory that this takes."""
+    if cloud.areas.any():
+        levelled = octaves.levelled(cloud, np.eye(3) if up is None else level_frame(up))
+        for unit_m in units_m:
+            find_blobs(*levelled, params.max_per_octave, octaves, unit_m)
+    octaves.free_workspace()
+
+
 def gravity_free(layer: NodeLayer, cloud: PointCloud, params: Params | None = None) -> NodeLayer:
     """Recompute the landmarks of an upright scene with shell contexts, which are comparable with scenes of unknown
     vertical.
@@ -120,6 +131,5 @@ def gravity_free(layer: NodeLayer, cloud: PointCloud, params: Params | None = No
     descriptor = descriptor_id(params, upright=False)
     if len(layer) == 0:
         return NodeLayer.empty(descriptor, 4 * NUM_SHELLS, layer.unit_m)
-    points = cloud.points * layer.unit_m
-    around = shell_context(layer.positions * layer.unit_m, points, cloud.lab)
+    around = shell_context(layer.positions * layer.unit_m, cloud.points, cloud.lab, layer.unit_m)
     return replace(layer, embeddings=embed(around, params.use_fitted_metric), descriptor_id=descriptor)
