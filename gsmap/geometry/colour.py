@@ -14,16 +14,26 @@ _BLOCK = 32_768  # number of colours per block, so that intermediate arrays stay
 
 
 def srgb_to_lab(rgb: np.ndarray) -> np.ndarray:
-    """Convert sRGB (..., 3) in [0, 1] to CIE L*a*b* (..., 3) float32 (IEC 61966-2-1, white point D65)."""
+    """Convert sRGB (..., 3) in [0, 1], or bytes, to CIE L*a*b* (..., 3) float32 (IEC 61966-2-1, white point D65)."""
     rgb = np.asarray(rgb)
-    if rgb.ndim == 2 and len(rgb) > _BLOCK:
-        return np.concatenate([_lab(rgb[i : i + _BLOCK]) for i in range(0, len(rgb), _BLOCK)])
+    flat = rgb.reshape(-1, 3)
+    if len(flat) > _BLOCK:
+        parts = [_lab(flat[i : i + _BLOCK]) for i in range(0, len(flat), _BLOCK)]
+        return np.concatenate(parts).reshape(rgb.shape)
     return _lab(rgb)
 
 
-def _lab(rgb: np.ndarray) -> np.ndarray:
+def _linear(rgb: np.ndarray) -> np.ndarray:
+    """Undo the transfer curve of sRGB."""
     rgb = np.clip(rgb.astype(np.float64), 0.0, 1.0)
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+
+
+_LINEAR_OF_BYTES = _linear(np.arange(256) / 255.0)
+
+
+def _lab(rgb: np.ndarray) -> np.ndarray:
+    linear = _LINEAR_OF_BYTES[rgb] if rgb.dtype == np.uint8 else _linear(rgb)
     xyz = linear @ _XYZ_RGB.T / _WHITE_D65
     f = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
     return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], -1).astype(

@@ -56,7 +56,7 @@ class BuiltinEmbedder:
         """Compute features (R, F) of the masks; see `gsmap.methods.embedder`."""
         if not masks:
             return np.zeros((0, sum(_PARTS)), np.float32)
-        lab = srgb_to_lab(view.rgb / 255.0)
+        lab = srgb_to_lab(view.rgb)
         seen = view.alpha > 0.5
         middle = np.median(lab[seen, 0]) if seen.any() else 50.0
         slope = np.hypot(*np.gradient(lab[..., 0])) / np.maximum(lab[..., 0], 5.0)

@@ -80,4 +80,12 @@ def giou(boxes: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 def box_of(points: np.ndarray) -> np.ndarray:
     """Compute the box (2, 3) of the points, without the outermost 2 percent on each side."""
-    return np.percentile(points, [2, 98] if len(points) > 20 else [0, 100], axis=0)
+    # As `numpy.percentile`, which takes ten times as long for few points.
+    last = len(points) - 1
+    at = last * np.array([[0.02], [0.98]] if len(points) > 20 else [[0.0], [1.0]])
+    low = np.floor(at).astype(int)[:, 0]
+    high = np.minimum(low + 1, last)
+    ordered = np.partition(points, np.unique([low, high]), axis=0)
+    step, share = ordered[high] - ordered[low], at - low[:, None]
+    box: np.ndarray = np.where(share < 0.5, ordered[low] + step * share, ordered[high] - step * (1 - share))
+    return box

@@ -61,8 +61,10 @@ class BuiltinSegmenter:
             if place is None:
                 continue
             window = tuple(slice(max(0, s.start - 1), s.stop + 1) for s in place)
+            if parts[window].size < _MIN_AREA * parts.size:
+                continue
             # Closing by a pixel bridges single Gaussians of other parts within a part.
-            pixels = ndimage.binary_closing(np.pad(parts[window] == part, 1), np.ones((3, 3), bool))[1:-1, 1:-1]
+            pixels = _over_3x3(np.logical_and, _over_3x3(np.logical_or, np.pad(parts[window] == part, 2)))
             labels, count = ndimage.label(pixels)
             sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
             for i in np.flatnonzero(sizes >= _MIN_AREA * parts.size):
@@ -70,6 +72,13 @@ class BuiltinSegmenter:
                 blob[window] = labels == i + 1
                 masks.append(Mask(blob, float(view.alpha[blob].mean() * sizes[i] / sizes.sum()), part))
         return masks
+
+
+def _over_3x3(join: np.ufunc, pixels: np.ndarray) -> np.ndarray:
+    """Join each pixel (H, W) with its 8 neighbours; the result has no border pixels (H - 2, W - 2)."""
+    rows = join(join(pixels[:-2], pixels[1:-1]), pixels[2:])
+    joined: np.ndarray = join(join(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
+    return joined
 
 
 def cut_surface(cloud: PointCloud, params: Params) -> np.ndarray:
