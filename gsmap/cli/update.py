@@ -56,6 +56,8 @@ def command(
             say(f"{row.scene_name}: {note}")
         if not row.new:
             say(f"{row.scene_name}: {row.outcome}")
+    for note in report.notes:
+        say(note)
     if json:
         print_rows("update", report, json)
     else:

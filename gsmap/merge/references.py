@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from gsmap.merge import photos
 from gsmap.merge.changes import ResolvedScenes, newest_first
 from gsmap.merge.overlap import share_in_view
 from gsmap.merge.reference_view_cache import surface_axes
+from gsmap.merge.sharpness import SharpnessComparison, SharpnessWeights, compared_views
 from gsmap.render import ChunkIndex, Rendering, render
 from gsmap.types import Cameras, Gaussians, PosedScene
 from gsmap.types.progress import Progress
@@ -24,6 +25,8 @@ WEIGHT_UNIT = 0.1
 MAX_VIEWS, PHOTO_WEIGHT = 360, 4.0  # defaults of `render_references`
 _MIN_TILE_FRACTION = 0.02  # smallest share of a view that must show the tile
 _FULL_TILE_FRACTION = 0.25  # with at least this share a view is used once in every pass, otherwise in proportion
+_STRIDE_PX = 8  # sharpness is looked up at every eighth pixel along each axis
+_MIN_COMPARED_WEIGHT = 0.95  # smallest weight of a pixel in which the sharpness of scenes is compared
 _MARGIN_PX = 6  # margin around the valid pixels of a view, for the windows of SSIM
 _MAX_PHOTOS = 120  # of a tile: the photos that show most of it
 
@@ -42,6 +45,7 @@ class References:
             dominates. A Gaussian that dominates none has `WEIGHT_UNIT` times its largest weight in any pixel; without
             views all have 1.
         num_photos: number of views that are photos.
+        sharpness: weight of each scene by place; lower where another scene is sharper.
     """
 
     cameras: Cameras
@@ -51,6 +55,7 @@ class References:
     view_weights: np.ndarray
     visible_pixels: list[np.ndarray]
     num_photos: int = 0
+    sharpness: SharpnessWeights = field(default_factory=lambda: SharpnessWeights({}))
 
     def __len__(self) -> int:
         return len(self.images)
@@ -93,7 +98,7 @@ def render_references(
         for c in np.flatnonzero(share_in_view(scene.cameras, piece.means) > 0)
     ]
     todo = _best_views(todo, scenes, pieces, max_views)
-    cameras, images, weights, kept, shares = [], [], [], [], []
+    cameras, images, weights, kept, shares, places = [], [], [], [], [], []
     pixels, sure = ([np.zeros(len(scene.gaussians), dtype=np.int64) for scene in scenes] for _ in range(2))
     largest = [np.zeros(len(scene.gaussians), dtype=np.float32) for scene in scenes]
     reference_views = [
@@ -110,6 +115,7 @@ def render_references(
         index if piece is scene.gaussians else ChunkIndex.build(scene.gaussians)
         for index, piece, scene in zip(indices, pieces, scenes, strict=True)
     ]
+    comparison, compared = SharpnessComparison(pieces, indices), compared_views([i for i, _, _ in todo])
     for done, (i, c, camera) in enumerate(todo):
         progress(done / len(todo), "rendering reference views")
         disputed = None
@@ -140,10 +146,14 @@ def render_references(
         if share < _MIN_TILE_FRACTION:
             continue
         cameras.append(_cropped(camera, window))
-        images.append(np.round(np.clip(colour, 0, 1) * 255).astype(np.uint8))
+        colour = np.clip(colour, 0, 1)
+        images.append(np.round(colour * 255).astype(np.uint8))
         weights.append(np.round(np.clip(weight, 0, 1) * 255).astype(np.uint8))
         kept.append(i)
         shares.append(share)
+        places.append(_coarse_points(cameras[-1], depth[window]))
+        if done in compared:
+            comparison.add(i, cameras[-1], colour, depth[window], weight > _MIN_COMPARED_WEIGHT)
     num_rendered = len(kept)
     for i, one in _photos(scenes, pieces, longest_side_px) if photo_weight else ():
         counts = one.counts & inside_pixels(one.camera, one.depth, bounds, halo_m / 2)
@@ -159,6 +169,9 @@ def render_references(
         kept.append(i)
         shares.append(share)
     often = np.minimum(1.0, np.array(shares) / _FULL_TILE_FRACTION)
+    sharpness = comparison.weights()
+    for row, (i, points) in enumerate(zip(kept, places, strict=False)):
+        often[row] *= _apply(weights[row], sharpness.at(i, points))
     often[num_rendered:] *= photo_weight
     return References(
         _concatenate_cameras(cameras),
@@ -171,6 +184,7 @@ def render_references(
             for p, s, w, shared in zip(pixels, sure, largest, reference_views, strict=True)
         ],
         num_photos=len(kept) - num_rendered,
+        sharpness=sharpness,
     )
 
 
@@ -236,6 +250,21 @@ def _count(
     undisputed = dominant >= 0 if disputed is None else (dominant >= 0) & ~disputed
     sure += np.bincount(dominant[undisputed], minlength=len(pixels))
     np.maximum(largest, seen.max_weight, out=largest)
+
+
+def _coarse_points(camera: Cameras, depth: np.ndarray) -> np.ndarray:
+    """Return the (h, w, 3) float32 surface points of every `_STRIDE_PX`-th pixel of a depth image."""
+    return np.stack([axis[::_STRIDE_PX, ::_STRIDE_PX] for axis in surface_axes(camera, depth)], axis=-1)
+
+
+def _apply(weights: np.ndarray, coarse: np.ndarray) -> float:
+    """Multiply the uint8 pixel weights (H, W) of a view in place by factors of every `_STRIDE_PX`-th pixel; return the
+    ratio of the sums after and before."""
+    height, width = weights.shape
+    rows, columns = np.arange(height) // _STRIDE_PX, np.arange(width) // _STRIDE_PX
+    before = weights.sum(dtype=np.float64)
+    weights[:] = np.round(weights * coarse[np.ix_(rows, columns)])
+    return float(weights.sum(dtype=np.float64) / max(before, 1))
 
 
 def _window(counts: np.ndarray) -> tuple[slice, slice]:

@@ -5,7 +5,13 @@
 CAPTURES is a folder of captures (``NAME.ply`` with ``NAME.cameras.json``), with ``truth/NAME.json`` holding
 ``T_scene_world`` and ``frames/`` holding pictures named like cameras. Rows: the oracle (each capture alone, at its own
 views), then each merging method, under true poses and, with --map, under the poses that a map made by ``gsmap update``
-from the same files estimated. Seconds are wall and CPU of the merge alone. MB is the size of the ``.ply``.
+from the same files estimated. Seconds are wall and CPU of the merge alone. MB is the size of the ``.ply``. "Worst" is
+the lowest difference, over captures, of the PSNR to that of the capture alone.
+
+    python -m tools.bench.merge CAPTURES --retrained c0:60 c1:420 --cache DIR    # captures of uneven quality
+
+With --retrained further captures join: each is trained anew for so many steps on renders of the capture named, from
+those of its cameras that have no picture. So no picture that judges it was trained on.
 """
 
 from __future__ import annotations
@@ -19,13 +25,17 @@ from pathlib import Path
 
 import numpy as np
 
+from gsmap import formats
 from gsmap.evaluate.renders import compare_renders, find_images
 from gsmap.export import plan_tiles
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.ingest import Capture, read_captures
 from gsmap.merge import default_params, merge, methods, reach_m
 from gsmap.merge.tile import LazyScene, merge_tile
+from gsmap.render import render
 from gsmap.types import Gaussians, MergeResult, PosedScene, Sim3
+from gsmap_synthetic.capture import Frames
+from gsmap_synthetic.make import fit_frames
 from tools.harness import argument_parser
 
 
@@ -34,6 +44,8 @@ def main() -> None:
     parser.add_argument("captures", type=Path)
     parser.add_argument("--scenes", nargs="+", default=["c0", "c1"], help="names of captures to merge")
     parser.add_argument("--images", type=Path, help="folder of pictures, CAPTURES/frames else")
+    parser.add_argument("--retrained", nargs="*", default=[], metavar="NAME:STEPS", help="add such captures")
+    parser.add_argument("--cache", type=Path, help="keep retrained captures here")
     parser.add_argument("--map", type=Path, help="a map of the same captures, for rows under estimated poses")
     parser.add_argument("--methods", nargs="*", choices=methods(), default=["union", "distance", "voxel", "tto"])
     parser.add_argument("--curve", nargs="*", type=float, default=[], help="tto at these sizes (share of the union)")
@@ -44,22 +56,43 @@ def main() -> None:
     captures = read_captures([arguments.captures / f"{name}.ply" for name in arguments.scenes])
     images = arguments.images or arguments.captures / "frames"
     truth = {c.name: true_pose(arguments.captures / "truth" / f"{c.name}.json") for c in captures}
+    for name, steps in (wanted.split(":") for wanted in arguments.retrained):
+        source = next(c for c in captures if c.name == name)
+        captures.append(retrained(source, int(steps), images, arguments.cache))
+        truth[captures[-1].name] = truth[name]
     poses = {"true": truth}
     if arguments.map:
         poses["estimated"] = estimated_poses(arguments.map, truth)
-    rows = [oracle_row(captures, images)]
+    pictures = {c.name: held_out(c, arguments.captures / "truth", images) for c in captures}
+    rows = [oracle_row(captures, pictures)]
     print_title()
     print_row(rows[0])
     for kind, S_map_scene in poses.items():
         for method in arguments.methods:
-            add(rows, merge_row(captures, S_map_scene, images, method, default_params(method), f"{method} ({kind})"))
+            add(rows, merge_row(captures, S_map_scene, pictures, method, default_params(method), f"{method} ({kind})"))
         for keep in arguments.curve:
             params = replace(default_params("tto"), kept_fraction=keep)
-            add(rows, merge_row(captures, S_map_scene, images, "tto", params, f"tto keep={keep:g} ({kind})"))
+            add(rows, merge_row(captures, S_map_scene, pictures, "tto", params, f"tto keep={keep:g} ({kind})"))
         if arguments.tiles:
-            add(rows, tiled_row(captures, S_map_scene, images, arguments.tiles, f"tto, tiles ({kind})"))
+            add(rows, tiled_row(captures, S_map_scene, pictures, arguments.tiles, f"tto, tiles ({kind})"))
     if arguments.json:
         arguments.json.write_text(json.dumps(rows, indent=1))
+
+
+def retrained(capture: Capture, steps: int, images: Path, cache: Path | None) -> Capture:
+    """The capture trained anew, on its own renders from cameras without pictures; kept in the folder ``cache``."""
+    name = f"{capture.name}-{steps}"
+    kept = None if cache is None else cache / f"{name}.ply"
+    if kept is not None and kept.exists():
+        gaussians = formats.read(kept)
+    else:
+        rows = sorted(set(range(len(capture.cameras))) - set(find_images(capture.cameras, images)))
+        seen = render(capture.gaussians, capture.cameras[rows])
+        frames = Frames((seen.colour.clip(0, 1) * 255).astype(np.uint8), capture.cameras[rows], seen.depth)
+        gaussians = fit_frames(frames, steps=steps, num_gaussians=len(capture.gaussians))
+        if kept is not None:
+            formats.write(kept, gaussians)
+    return Capture(gaussians, capture.cameras, name)
 
 
 def true_pose(path: Path) -> Sim3:
@@ -76,11 +109,18 @@ def estimated_poses(map_folder: Path, truth: dict[str, Sim3]) -> dict[str, Sim3]
     return {name: Sim3.from_matrix(np.array(s["S_map_scene"])) for name, s in placed.items()}
 
 
-def likeness(merged: Gaussians, captures: list[Capture], S_map_scene: dict[str, Sim3], images: Path) -> dict:
+def held_out(capture: Capture, truth: Path, images: Path) -> dict[int, Path]:
+    """Pictures of a capture by camera; only those that it was not trained on where its truth names them."""
+    found = find_images(capture.cameras, images)
+    about = truth / f"{capture.name}.json"
+    names = json.loads(about.read_text()).get("held_out") if about.exists() else None
+    return found if names is None else {row: path for row, path in found.items() if capture.cameras.names[row] in names}
+
+
+def likeness(merged: Gaussians, captures: list[Capture], S_map_scene: dict[str, Sim3], pictures: dict) -> dict:
     """Mean figures over all pictures of all captures, rendered from the captures' cameras in the map."""
     parts = [
-        compare_renders(merged, transform_cameras(c.cameras, S_map_scene[c.name]), find_images(c.cameras, images))
-        for c in captures
+        compare_renders(merged, transform_cameras(c.cameras, S_map_scene[c.name]), pictures[c.name]) for c in captures
     ]
     return {
         "psnr_db": float(np.concatenate([p.psnr_db for p in parts]).mean()),
@@ -89,8 +129,8 @@ def likeness(merged: Gaussians, captures: list[Capture], S_map_scene: dict[str, 
     }
 
 
-def oracle_row(captures: list[Capture], images: Path) -> dict:
-    parts = [compare_renders(c.gaussians, c.cameras, find_images(c.cameras, images)) for c in captures]
+def oracle_row(captures: list[Capture], pictures: dict) -> dict:
+    parts = [compare_renders(c.gaussians, c.cameras, pictures[c.name]) for c in captures]
     count = sum(len(c.gaussians) for c in captures)
     return {
         "name": "oracle (each alone)",
@@ -99,11 +139,12 @@ def oracle_row(captures: list[Capture], images: Path) -> dict:
         "psnr_db_by_scene": {c.name: float(p.psnr_db.mean()) for c, p in zip(captures, parts, strict=True)},
         "num_gaussians": count,
         "share": 1.0,
+        "worst_db": 0.0,
         "mb": ply_mb(captures[0].gaussians) / len(captures[0].gaussians) * count,
     }
 
 
-def merge_row(captures, S_map_scene, images, method, params, name, *, run=None) -> dict:
+def merge_row(captures, S_map_scene, pictures, method, params, name, *, run=None) -> dict:
     scenes = [
         PosedScene(
             transform_gaussians(c.gaussians, S_map_scene[c.name]),
@@ -118,7 +159,7 @@ def merge_row(captures, S_map_scene, images, method, params, name, *, run=None) 
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     return {
         "name": name,
-        **likeness(result.gaussians, captures, S_map_scene, images),
+        **likeness(result.gaussians, captures, S_map_scene, pictures),
         "num_gaussians": len(result.gaussians),
         "share": len(result.gaussians) / sum(len(c.gaussians) for c in captures),
         "mb": ply_mb(result.gaussians),
@@ -129,7 +170,7 @@ def merge_row(captures, S_map_scene, images, method, params, name, *, run=None) 
     }
 
 
-def tiled_row(captures, S_map_scene, images, tile_size_m, name) -> dict:
+def tiled_row(captures, S_map_scene, pictures, tile_size_m, name) -> dict:
     """The same map merged tile by tile, all tiles rendered together."""
     bounds = {c.name: np.array([c.gaussians.means.min(0), c.gaussians.means.max(0)]) for c in captures}
     by_name = {c.name: c for c in captures}
@@ -149,7 +190,7 @@ def tiled_row(captures, S_map_scene, images, tile_size_m, name) -> dict:
             merged, np.zeros(len(merged), int), steps=sum(r.steps for r in results), notes=(f"{made} tiles",)
         )
 
-    return merge_row(captures, S_map_scene, images, "tto", default_params("tto"), name, run=in_tiles)
+    return merge_row(captures, S_map_scene, pictures, "tto", default_params("tto"), name, run=in_tiles)
 
 
 def ply_mb(gaussians: Gaussians) -> float:
@@ -157,6 +198,8 @@ def ply_mb(gaussians: Gaussians) -> float:
 
 
 def add(rows: list[dict], row: dict) -> None:
+    alone = rows[0]["psnr_db_by_scene"]
+    row["worst_db"] = min(db - alone[name] for name, db in row["psnr_db_by_scene"].items())
     rows.append(row)
     print_row(row)
 
@@ -167,6 +210,7 @@ def print_title() -> None:
         ("SSIM", 6),
         ("Gaussians", 9),
         ("share", 6),
+        ("worst", 6),
         ("MB", 6),
         ("wall s", 7),
         ("CPU s", 7),
@@ -178,7 +222,8 @@ def print_title() -> None:
 def print_row(r: dict) -> None:
     print(
         f"{r['name']:30} {r['psnr_db']:6.2f} {r['ssim']:6.4f} {r['num_gaussians']:9d} {r['share']:6.1%} "
-        f"{r['mb']:6.1f} {r.get('wall_s', 0):7.1f} {r.get('cpu_s', 0):7.1f} {r.get('steps', 0):5d}",
+        f"{r['worst_db']:+6.2f} {r['mb']:6.1f} {r.get('wall_s', 0):7.1f} {r.get('cpu_s', 0):7.1f} "
+        f"{r.get('steps', 0):5d}",
         flush=True,
     )
 

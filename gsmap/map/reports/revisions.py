@@ -11,6 +11,7 @@ from gsmap.map.reports.common import names, refs, scenes_by_id
 from gsmap.map.reports.pairs import edges_of_pairs
 from gsmap.map.reports.scenes import scene_rows
 from gsmap.map.snapshot_read import snapshot_read
+from gsmap.map.undated_overlaps import undated_notes
 from gsmap.store import Store
 from gsmap.store.revisions import Revision
 from gsmap.types.metric_scale import MetricScale
@@ -133,4 +134,5 @@ def update_report(
         scenes=tuple(scene_rows(store, metres=metres() if scenes else None, among=scenes)),
         edges=tuple(edges_of_pairs(store, pairs)),
         revision=None if newest is None else revision_row(store, newest),
+        notes=undated_notes(store, store.scenes.summaries()) if pairs else (),
     )

@@ -31,7 +31,7 @@ from gsmap.render.fitter import FitOptions, LearningRates
 from gsmap.types import Gaussians, MergeResult, PosedScene
 from gsmap.types.progress import Progress
 
-VERSION = 9
+VERSION = 10
 """Version, raised whenever the result for the same scenes changes, also through modules of `gsmap.merge` that it
 calls."""
 STEPS: str | None = "steps"
@@ -230,6 +230,9 @@ def _start(
         # Gaussians that are occluded in newer scenes do not count in the selection of an owner.
         behind = np.concatenate(settled.behind)[near][heaviest]
         votes = np.where(behind, np.minimum(visible, WEIGHT_UNIT), visible)
+        for scene in np.unique(origin):
+            mine = origin == scene
+            votes[mine] *= wanted.sharpness.at(int(scene), merged.means[mine])
         stays &= select_owners(merged, origin, votes, _OWNER_CELL_M, _COVER_M)
     stays &= visible >= WEIGHT_UNIT * params.min_weight
     stays |= new

@@ -110,9 +110,11 @@ class UpdateReport(Row):
         scenes: scenes that are new, were described, or whose pose or status changed.
         edges: current edges of the pairs that were registered or whose use changed.
         revision: the newest revision; null if there is none.
+        notes: remarks, such as differences between overlapping captures without dates.
     """
 
     ingested: tuple[IngestRow, ...]
     scenes: tuple[SceneRow, ...]
     edges: tuple[EdgeRow, ...]
     revision: RevisionRow | None
+    notes: tuple[str, ...] = ()
