@@ -214,7 +214,7 @@ def condition(
     Along degenerate directions (`degeneracy`) colours and the ``correspondences`` constrain the pose, as in refinement;
     where nothing constrains it, its error is as large as the overlap.
     """
-    blocks = _Blocks.of(target, source, pose)
+    blocks = PairBlocks.of(target, source, pose)
     if blocks is None:
         return None
     hessian = _measured_hessian(target, source, pose, blocks)
@@ -271,12 +271,12 @@ def _other_information(
     target: Surface,
     source: Surface,
     pose: Sim3,
-    blocks: _Blocks,
+    blocks: PairBlocks,
     correspondences: Correspondences | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the information of everything but planes, and the covariance of its gradients: both (7, 7), about the
-    overlap's centroid, in the weights of `_Blocks`. It comes from colours, correspondences and a prior as wide as the
-    overlap."""
+    overlap's centroid, in the weights of `PairBlocks`. It comes from colours, correspondences and a prior as wide as
+    the overlap."""
     variance = max(blocks.noise_m, 1e-6) ** 2
     anywhere = blocks.points / blocks.points[3, 3] * variance / blocks.radius_m**2
     constrained, errors = anywhere.copy(), variance * anywhere
@@ -349,7 +349,7 @@ def unobserved_motion(
     return unobserved.rotation_per_shift * shift / radius_m, shift
 
 
-def _measured_hessian(target: Surface, source: Surface, pose: Sim3, blocks: _Blocks) -> np.ndarray:
+def _measured_hessian(target: Surface, source: Surface, pose: Sim3, blocks: PairBlocks) -> np.ndarray:
     """Return the (7, 7) Hessian of the squared residuals about the overlap's centroid, where each probe finds new
     pairs.
 
@@ -360,7 +360,7 @@ def _measured_hessian(target: Surface, source: Surface, pose: Sim3, blocks: _Blo
     """
     chosen = source.sample(_PROBE_POINTS)
     points, centre = source.coarse[0][chosen], Sim3(np.eye(3), blocks.centroid)
-    oriented = _oriented_normals(source, pose)
+    oriented = oriented_normals(source, pose)
     oriented = None if oriented is None else oriented[chosen]
     spread = np.r_[np.full(3, 1 / blocks.radius_m), np.ones(3), 1 / blocks.radius_m]
     observed = np.empty((7, 7))
@@ -378,7 +378,7 @@ def _measured_hessian(target: Surface, source: Surface, pose: Sim3, blocks: _Blo
     return measured
 
 
-def _oriented_normals(source: Surface, pose: Sim3) -> np.ndarray | None:
+def oriented_normals(source: Surface, pose: Sim3) -> np.ndarray | None:
     """Return the (M, 3) oriented normals of the source's cells in the target's frame; zeros where the orientation is
     unknown."""
     return None if source.oriented_normals is None else source.oriented_normals @ pose.rotation.T
@@ -422,7 +422,7 @@ def point_to_plane_jacobian(pose: Sim3, points: np.ndarray, normals: np.ndarray)
 
 
 @dataclass(frozen=True, eq=False)
-class _Blocks:
+class PairBlocks:
     """Weighted means of the pairs under a pose, over B blocks.
 
     Derivatives are about ``centroid``: rotation and translation then hardly mix, and the matrices are well scaled.
@@ -447,10 +447,15 @@ class _Blocks:
     radius_m: float
 
     @classmethod
-    def of(cls, target: Surface, source: Surface, pose: Sim3) -> _Blocks | None:
-        points, _ = source.coarse
+    def of(cls, target: Surface, source: Surface, pose: Sim3, points: np.ndarray | None = None) -> PairBlocks | None:
+        """Pair the cells of two surfaces; None where the overlap is too small.
+
+        Args:
+            points: (M, 3) positions of the source's cells; default: as they are.
+        """
+        points = source.coarse[0] if points is None else points
         moved = pose.apply(points)
-        distance, row = target.nearest(moved, RADIUS_M, _oriented_normals(source, pose))
+        distance, row = target.nearest(moved, RADIUS_M, oriented_normals(source, pose))
         hit = np.flatnonzero(np.isfinite(distance))
         if len(hit) < _MIN_CELLS:
             return None

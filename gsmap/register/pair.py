@@ -15,6 +15,7 @@ from gsmap.register.pose_selection import EvaluatedPose, is_same_pose, select_po
 from gsmap.register.proposal_rounds import ProposalRounds
 from gsmap.register.scale_selection import refine_and_select_scale
 from gsmap.register.scene_view import SceneView
+from gsmap.register.strain import fit_strain
 from gsmap.register.timing import Stopwatch
 from gsmap.types import Registration, Sim3
 from gsmap.types.progress import Progress, silent
@@ -182,4 +183,11 @@ def _evaluate(
     proposal = refined
     flaw = flaw or verdict.decide(proposal, seen, None if uncertainty is None else uncertainty.sigmas, params.verdict)
     in_units = None if uncertainty is None else covariance.in_scene_units(uncertainty.covariance, pair.source.unit_m)
-    return EvaluatedPose(proposal, seen, in_units, flaw, decision)
+    strain = None
+    if in_units is not None and not flaw:
+        with watch.step("refine"):
+            found = fit_strain(*surfaces, pose)
+        if found is not None and found.is_stretched:
+            strain = found
+            in_units = in_units + covariance.in_scene_units(strain.covariance(pose.scale), pair.source.unit_m)
+    return EvaluatedPose(proposal, seen, in_units, flaw, decision, strain)

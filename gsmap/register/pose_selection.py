@@ -17,6 +17,7 @@ from gsmap.register.params import Params
 from gsmap.register.probability import probability
 from gsmap.register.proposal_rounds import num_nodes
 from gsmap.register.scene_view import SceneView
+from gsmap.register.strain import Strain
 from gsmap.register.unit_scale import ScaleDecision
 from gsmap.types import Registration, Sim3
 from gsmap.types.registration import Proposal
@@ -37,6 +38,7 @@ class EvaluatedPose:
         covariance: (7, 7) covariance of the pose, translations in the source's unit; None if not computed.
         flaw: reason why the pose is not accepted; empty if it is.
         decision: decision on the scale; None if it was not measured, or if the unit of a scene is unknown.
+        strain: change of shape that would align the source; None if a similarity aligns it.
     """
 
     proposal: Proposal
@@ -44,6 +46,7 @@ class EvaluatedPose:
     covariance: np.ndarray | None
     flaw: str
     decision: ScaleDecision | None = None
+    strain: Strain | None = None
 
 
 def select_pose(
@@ -86,6 +89,8 @@ def select_pose(
         information = 0.5 * (information + information.T)
         if best.decision is not None and best.decision.note:
             notes = (*notes, best.decision.note)
+        if best.strain is not None:
+            notes = (*notes, best.strain.note())
     return Registration(
         status=status,
         reason=why,
