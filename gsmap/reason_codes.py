@@ -283,6 +283,7 @@ ERRORS: Final[Mapping[str, str]] = {
     "catalog_refused": "The catalog refused an operation.",
     "catalog_unreadable": "The catalog cannot be opened or read.",
     "database_not_empty": "The database for a catalog holds tables already.",
+    "unsupported_encoding": "The database for a catalog does not store its texts as UTF-8.",
     "hostile_journal": "A journal of the catalog belongs to another file.",
     "index_damaged": "The retrieval index is damaged.",
     "invalid_column_value": "A value cannot be stored in its column.",

@@ -7,10 +7,10 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Column, Connection, Double, Integer, MetaData, Table, delete, select, text, update
+from sqlalchemy import Column, Connection, Double, Engine, Integer, MetaData, Table, delete, select, text, update
 from sqlalchemy.types import TypeDecorator
 
-from gsmap.errors import StoreError
+from gsmap.errors import ConfigError, StoreError
 from gsmap.store import catalog as _catalog
 from gsmap.store import migrate, schema, sqlite, trust
 from gsmap.store.catalog import Catalog
@@ -38,12 +38,14 @@ def empty_catalog(folder: Path, url: str | None = None, map_id: str = "") -> Cat
 
     Raises:
         StoreError: the database already holds a map.
+        ConfigError: the database does not store its texts as UTF-8.
     """
     if url is None:
         sqlite.create_file(folder / sqlite.FILE)
         made = open_sqlite_catalog(folder)
     else:
         engine = _catalog.url_engine(url)
+        _require_utf8(engine, folder)
         if migrate.version(engine, folder) is not None:
             raise StoreError(
                 f"the database {engine.url!r} holds a map already: give each map a database of its own",
@@ -53,6 +55,19 @@ def empty_catalog(folder: Path, url: str | None = None, map_id: str = "") -> Cat
         made = Catalog(folder, engine, writable=True)
     migrate.upgrade(made)
     return made
+
+
+def _require_utf8(engine: Engine, folder: Path) -> None:
+    """Raise an error for a database of another encoding; SQLAlchemy fails on its texts, which are bytes."""
+    positional, named = engine.dialect.create_connect_args(engine.url)
+    with translate_errors(folder), contextlib.closing(engine.dialect.connect(*positional, **named)) as connection:
+        encoding = connection.info.parameter_status("server_encoding")
+    if encoding != "UTF8":
+        raise ConfigError(
+            f"the database {engine.url!r} has the encoding {encoding}, but a catalog needs UTF8: create it with "
+            "CREATE DATABASE name TEMPLATE template0 ENCODING 'UTF8'",
+            code="unsupported_encoding",
+        )
 
 
 def open_sqlite_catalog(folder: Path) -> Catalog:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import store_children
 from raising import raises
+from sqlalchemy import create_engine
 from store_children import messages
 from store_samples import key, make_cameras, make_gaussians
 from test_store_nouns import graph_of, layer, registration, tile
@@ -66,6 +67,17 @@ def test_migrated_tables_are_the_schema_on_postgres(tmp_path, postgres_database)
     with Store.create(tmp_path / "m", catalog_url=postgres_database) as store, store.catalog.read() as connection:
         options = {"compare_type": True, "include_name": lambda name, kind, _: name != schema.CHUNK_BOXES}
         assert compare_metadata(MigrationContext.configure(connection, opts=options), schema.metadata) == []
+
+
+def test_a_database_whose_texts_are_bytes_is_refused(tmp_path, postgres_url):
+    admin = create_engine(postgres_url.format("postgres"), isolation_level="AUTOCOMMIT")
+    with admin.connect() as connection:
+        options = "TEMPLATE template0 ENCODING 'SQL_ASCII' LC_COLLATE 'C' LC_CTYPE 'C'"
+        connection.exec_driver_sql(f"CREATE DATABASE ascii {options}")
+    admin.dispose()
+    with raises(ConfigError, code="unsupported_encoding"):
+        Store.create(tmp_path / "m", catalog_url=postgres_url.format("ascii"))
+    assert not (tmp_path / "m").exists()
 
 
 def test_the_password_stays_out_of_the_map(tmp_path, guarded_database, monkeypatch):
