@@ -15,7 +15,6 @@ from gsmap.register.pose_selection import EvaluatedPose, is_same_pose, select_po
 from gsmap.register.proposal_rounds import ProposalRounds
 from gsmap.register.scale_selection import refine_and_select_scale
 from gsmap.register.scene_view import SceneView
-from gsmap.register.strain import fit_strain
 from gsmap.register.timing import Stopwatch
 from gsmap.types import Registration, Sim3
 from gsmap.types.progress import Progress, silent
@@ -185,6 +184,8 @@ def _evaluate(
     in_units = None if uncertainty is None else covariance.in_scene_units(uncertainty.covariance, pair.source.unit_m)
     strain = None
     if in_units is not None and not flaw:
+        from gsmap.register.strain import fit_strain  # imported here, as the recipe key does not need it
+
         with watch.step("refine"):
             found = fit_strain(*surfaces, pose)
         if found is not None and found.is_stretched:

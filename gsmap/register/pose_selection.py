@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,10 +17,12 @@ from gsmap.register.params import Params
 from gsmap.register.probability import probability
 from gsmap.register.proposal_rounds import num_nodes
 from gsmap.register.scene_view import SceneView
-from gsmap.register.strain import Strain
 from gsmap.register.unit_scale import ScaleDecision
 from gsmap.types import Registration, Sim3
 from gsmap.types.registration import Proposal
+
+if TYPE_CHECKING:
+    from gsmap.register.strain import Strain
 
 # Two poses count as the same if all their differences are below these limits: refinement would merge them.
 SAME_ROTATION_DEG = 3.0

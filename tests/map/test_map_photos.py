@@ -108,7 +108,7 @@ def known(*photos: StoredPhoto, S: Sim3 | None = None) -> MapObjects:
     thing = an_object(seen("a"), seen("b"))
     at = {"a": S or Sim3.identity(), "b": Sim3.identity()}
     objects = add_photo_observations([thing], photos, SCENES, at, {0: 1.0}, {"a": 0, "b": 0})
-    names = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at) for one in photos}
+    names = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at, one.created_at) for one in photos}
     return MapObjects(objects, SCENES, (), {0: 1.0}, names)
 
 

@@ -11,7 +11,6 @@ from gsmap.map.reports.common import names, refs, scenes_by_id
 from gsmap.map.reports.pairs import edges_of_pairs
 from gsmap.map.reports.scenes import scene_rows
 from gsmap.map.snapshot_read import snapshot_read
-from gsmap.map.undated_overlaps import undated_notes
 from gsmap.store import Store
 from gsmap.store.revisions import Revision
 from gsmap.types.metric_scale import MetricScale
@@ -124,6 +123,8 @@ def update_report(
     Args:
         metres: returns the metric scale of every component of the newest poses.
     """
+    from gsmap.map.undated_overlaps import undated_notes  # imported here, as verbs that only read do not need it
+
     scenes, pairs = store.revisions.changed_after(since.revision)
     scenes |= {scene for group, scene in store.graphs.groups().items() if group not in since.graphs}
     scenes |= {row.scene for row in ingested if row.new or row.dated}

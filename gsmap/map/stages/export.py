@@ -28,7 +28,6 @@ from gsmap.map.metric_scales import map_metres, metre_notes
 from gsmap.map.settings import Settings
 from gsmap.map.shared_jobs import note_interruption
 from gsmap.map.static_filter import DynamicContent, dynamic_notes, find_dynamic_content
-from gsmap.map.undated_overlaps import undated_notes
 from gsmap.map.world import GeoreferencedComponent, georeferenced_components, world_notes
 from gsmap.merge import photos_m, reach_m, recipe_key, uses_dates, with_prefer, with_steps
 from gsmap.merge.reference_view_cache import ReferenceViewCache
@@ -168,6 +167,8 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
         placed = {scene: placed[scene] for scene in scenes}
     if uses_dates(method, params):
         recipe = recipe.with_dates({scene: found.captured_at for scene, found in scenes.items()})
+        from gsmap.map.undated_overlaps import undated_notes  # imported here, as status does not need it
+
         notes += undated_notes(store, scenes.values())
     passing: dict[str, DynamicContent] = {}
     if request.static:
