@@ -27,9 +27,17 @@ def find(folder: Path) -> Path | None:
     projects = sorted(folder.glob("*.opf"))
     if len(projects) == 1:
         return projects[0]
-    if any((folder / name).is_dir() for name in phone_scans.POLYCAM):
-        return next(folder / name for name in phone_scans.POLYCAM if (folder / name).is_dir())
+    for name in phone_scans.POLYCAM:
+        if any((folder / name).glob("*.json")):
+            return folder / name
     return folder if all((folder / name).is_file() for name in phone_scans.STRAY) else None
+
+
+def is_of_trainer(path: Path) -> bool:
+    """Return true for camera files of trainers: ``cameras.json``, ``transforms.json`` and COLMAP models."""
+    if path.is_dir():
+        return colmap.find_model(path) is not None
+    return path.suffix.lower() == ".json" and path.name != "metadata.json"
 
 
 def read(path: str | os.PathLike[str]) -> Cameras:
@@ -62,9 +70,9 @@ def _reader(path: Path) -> Callable[[], Cameras]:
     if path.is_dir():
         if (model := colmap.find_model(path)) is not None:
             return lambda: colmap.read(model)
-        if path.name in {name.rpartition("/")[2] for name in phone_scans.POLYCAM}:
-            return lambda: phone_scans.read_polycam(path)
         found = find(path)
+        if found is None and path.name in {name.rpartition("/")[2] for name in phone_scans.POLYCAM}:
+            return lambda: phone_scans.read_polycam(path)
         if found is None:
             raise InputError(
                 f"{path} holds no cameras: the folder has no COLMAP model (cameras.bin/.txt), no transforms.json, no "

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 _RADIAL = ("k1", "k2", "k3", "k4")
+_MAX_BYTES = 1 << 28
+_LOCAL = ("", "LOCAL_CS", "ENGCRS")  # coordinate systems whose metres are those of the exports
 
 
 def read(path: Path) -> Cameras:
@@ -32,11 +34,18 @@ def read(path: Path) -> Cameras:
     Raises:
         NotFoundError: the file is missing.
         NotPinholesError: gsmap knows none of the lenses.
-        InputError: no XML, or no cameras with poses.
+        InputError: no XML, no cameras with poses, or poses in Earth-centred coordinates.
     """
     chunk = _root(path).find("chunk")
     if chunk is None:
         raise InputError(f"{path} holds no cameras of Metashape: it has no chunk", code="no_cameras")
+    system = (chunk.findtext("reference") or "").partition("[")[0].strip()
+    if system not in _LOCAL and chunk.find("components/component/transform") is not None:
+        raise InputError(
+            f"{path}: the chunk is georeferenced, so its poses are Earth-centred and not in the frame of its exports: "
+            "export the cameras in local coordinates",
+            code="invalid_cameras",
+        )
     models = {sensor.get("id"): _model(sensor) for sensor in chunk.findall("sensors/sensor")}
     components = {one.get("id"): _component(one) for one in chunk.findall("components/component")}
     poses: list[np.ndarray] = []
@@ -61,9 +70,12 @@ def _root(path: Path) -> Element:
 
     if not path.exists():
         raise NotFoundError(f"cannot read cameras from {path}: no such file", code="file_not_found")
+    if path.stat().st_size > _MAX_BYTES:
+        raise InputError(f"{path} is too large for a file of cameras", code="invalid_cameras")
     text = path.read_bytes()
-    if re.search(rb"<!(DOCTYPE|ENTITY)", text):  # entities could expand without bound
-        raise InputError(f"{path} declares a document type, which Metashape does not write", code="invalid_cameras")
+    # Entities could expand without bound; in UTF-16 they would not be found.
+    if b"\0" in text or re.search(rb"<!(DOCTYPE|ENTITY)", text):
+        raise InputError(f"{path} is not the XML that Metashape writes (UTF-8, no DOCTYPE)", code="invalid_cameras")
     try:
         return ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as error:

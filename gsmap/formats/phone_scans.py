@@ -16,6 +16,7 @@ from gsmap.types import Cameras
 _OPENGL = np.array([1.0, -1.0, -1.0])  # right-up-back camera axes in terms of right-down-front
 POLYCAM = ("keyframes/corrected_cameras", "keyframes/cameras")
 STRAY = ("odometry.csv", "camera_matrix.csv")
+_MAX_MOVIE_BYTES = 1 << 26  # of the index of a video
 
 
 def read_polycam(folder: Path) -> Cameras:
@@ -86,15 +87,37 @@ def _poses(places: np.ndarray, quats_xyzw: np.ndarray, axes: np.ndarray) -> np.n
 
 
 def _video_size(path: Path) -> tuple[int, int]:
-    """Return width and height of an MP4 from its track header (ISO 14496-12, 8.3.2), whose last values they are."""
-    content = path.read_bytes() if path.is_file() else b""
-    at = content.find(b"tkhd")
-    while at >= 0:
-        (length,) = struct.unpack(">I", content[at - 4 : at])
-        width, height = (value >> 16 for value in struct.unpack(">II", content[at + length - 12 : at + length - 4]))
-        if width and height:
-            return width, height
-        at = content.find(b"tkhd", at + 4)
+    """Return width and height of an MP4, which are the last values of a track's header (ISO 14496-12, 8.3.2).
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    if path.is_file():
+        content = _movie_box(path)
+        at = content.find(b"tkhd")
+        while at >= 4:
+            end = at - 4 + int.from_bytes(content[at - 4 : at], "big")
+            sides = content[end - 8 : end]
+            if at + 4 <= end - 8 and len(sides) == 8:
+                width, height = (value >> 16 for value in struct.unpack(">II", sides))
+                if width and height:
+                    return width, height
+            at = content.find(b"tkhd", at + 4)
     raise InputError(
         f"cannot read the size of the frames of {path.parent}: {path} is missing or damaged", code="invalid_cameras"
     )
+
+
+def _movie_box(path: Path) -> bytes:
+    """Return the content of the box ``moov`` of an MP4; empty without one of a plausible size."""
+    with open(path, "rb") as file:
+        while len(head := file.read(8)) == 8:
+            size, kind, skipped = int.from_bytes(head[:4], "big"), head[4:], 8
+            if size == 1:
+                size, skipped = int.from_bytes(file.read(8), "big"), 16
+            if kind == b"moov":
+                return file.read(min(max(size - skipped, 0), _MAX_MOVIE_BYTES))
+            if size < skipped:  # to the end of the file, or damaged
+                break
+            file.seek(size - skipped, 1)
+    return b""

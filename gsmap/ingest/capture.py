@@ -6,13 +6,14 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 
 from gsmap import formats
-from gsmap.errors import ConfigError, NotPinholesError
+from gsmap.errors import ConfigError, GsmapError, InputError, NotPinholesError
+from gsmap.formats.cameras import is_of_trainer
 from gsmap.formats.precision import about_origin, format_origin, rounded_to
 from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.transforms import transform_cameras
@@ -109,15 +110,17 @@ def read_capture(
     about = formats.info(found.path)
     source = Path(cameras) if cameras is not None else found.cameras
     lens_note = ""
+    # Files that only lie beside a splat, and may be of another program or frame, are left out with a note.
+    may_be_foreign = cameras is None and source is not None and not is_of_trainer(source)
     try:
         given = None if source is None else formats.read_cameras(source)
-    except NotPinholesError as error:
-        if cameras is not None:
+    except GsmapError as error:
+        if cameras is not None or not (may_be_foreign or isinstance(error, NotPinholesError)):
             raise
         given, lens_note = None, str(error)
-    capture = take_capture(
+    take = partial(
+        take_capture,
         gaussians,
-        given,
         name=name or found.name,
         captured_at=captured_at,
         scale_policy=scale_policy,
@@ -126,6 +129,13 @@ def read_capture(
         source=str(found.path),
         cameras_source="" if source is None else str(source),
     )
+    try:
+        capture = take(given)
+    except InputError as error:
+        if not may_be_foreign or error.code not in ("cameras_see_nothing", "invalid_camera"):
+            raise
+        given, lens_note = None, str(error)
+        capture = take(None)
     notes = (*about.notes, *(note for note in (found.note, lens_note) if note), *capture.notes)
     capture = replace(capture, antialiased=about.antialiased, notes=notes)
     if captured_at is not None:

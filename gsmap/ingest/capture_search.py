@@ -242,7 +242,8 @@ def _file(path: Path, *, alone: bool) -> CaptureFiles:
     shared = _shared_cameras(path)
     if shared is None or alone:
         return CaptureFiles(path, shared, name, names=names, alone=alone)
-    note = f"{shared.name} was not used, as several captures lie beside it (rename it to {own.name}, or pass --cameras)"
+    rename = f"rename it to {own.name}, or " if shared.suffix == ".json" else ""
+    note = f"{shared.name} was not used, as several captures lie beside it ({rename}pass --cameras)"
     return CaptureFiles(path, None, name, note, names, alone)
 
 

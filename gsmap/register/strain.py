@@ -134,7 +134,7 @@ def fit_strain(target: Surface, source: Surface, pose: Sim3) -> Strain | None:
     blocks = PairBlocks.of(target, source, pose, points + (points - centroid) @ matrix)
     if blocks is None or (covariance := _covariance(blocks, pose)) is None:
         return None
-    statistic = float(strain @ np.linalg.solve(covariance, strain))
+    statistic = float(strain @ np.linalg.pinv(covariance, hermitian=True) @ strain)
     inside = local[np.linalg.norm(local, axis=1) < radius_m]
     rms_m = float(np.sqrt(((inside @ matrix) ** 2).sum(1).mean())) if len(inside) else 0.0
     log10_p = float(chi2_log_survival(statistic, 5)) / np.log(10.0)

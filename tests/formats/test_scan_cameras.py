@@ -16,6 +16,7 @@ from gsmap import formats
 from gsmap.errors import InputError, NotPinholesError
 from gsmap.formats import read_cameras
 from gsmap.geometry.camera_models import project_with
+from gsmap.ingest import read_captures
 from gsmap.ingest.capture_search import find_captures
 from gsmap.types import Cameras, Gaussians
 
@@ -106,15 +107,25 @@ def test_metashape_lenses_that_colmap_lacks_are_named(tmp_path: Path, sensor: st
         "<document><chunk/></document>",
         metashape()[:700],
         '<!DOCTYPE d [<!ENTITY a "b">]>' + metashape().partition("?>")[2],
+        metashape(component="<transform><scale>1</scale></transform>").replace(
+            "<components", '<reference>GEOGCS["WGS 84"]</reference><components'
+        ),
         metashape().replace('width="640"', 'width="x"'),
         metashape().replace("<f>500</f>", "<f>0</f>"),
     ],
-    ids=("empty", "no chunk", "no cameras", "cut", "entities", "size", "focal length"),
+    ids=("empty", "no chunk", "no cameras", "cut", "entities", "Earth-centred", "size", "focal length"),
 )
 def test_damaged_metashape_files_are_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "cameras.xml").write_text(text)
     with raises(InputError, code=("invalid_cameras", "no_cameras"), match="cameras.xml"):
         read_cameras(tmp_path / "cameras.xml")
+
+
+def test_entities_in_another_encoding_are_refused(tmp_path: Path) -> None:
+    text = '<?xml version="1.0" encoding="UTF-16"?><!DOCTYPE d [<!ENTITY a "b">]><d>&a;</d>'
+    (tmp_path / "cameras.xml").write_bytes(text.encode("utf-16"))
+    with raises(InputError, code="invalid_cameras"):
+        read_cameras(tmp_path)
 
 
 def opf(folder: Path, internals: dict[str, Any] | None = None, uri: str = "calibrated.json") -> Path:
@@ -178,10 +189,17 @@ def test_polycam(tmp_path: Path) -> None:
     one = {f"t_{row}{column}": arkit[row, column] for row in range(3) for column in range(4)}
     lens = {"fx": 700.0, "fy": 701.0, "cx": 510.0, "cy": 380.0, "width": 1024, "height": 768}
     (folder / "123.json").write_text(json.dumps(one | lens | {"blur_score": 90.0}))
+    (tmp_path / "keyframes" / "cameras").mkdir()
     cameras = read_cameras(tmp_path)
     assert (cameras.names, cameras.sizes_px.tolist()) == (("123.jpg",), [[1024, 768]])
     np.testing.assert_allclose(cameras.T_frame_camera[0], POSE, atol=1e-12)
     assert cameras.intrinsics_px[0].tolist() == [700, 701, 510, 380]
+
+
+def test_a_folder_called_cameras_is_read_for_what_it_holds(tmp_path: Path) -> None:
+    (tmp_path / "cameras").mkdir()
+    (tmp_path / "cameras" / "cameras.xml").write_text(metashape())
+    assert read_cameras(tmp_path / "cameras").names == ("a.jpg",)
 
 
 def test_record3d(tmp_path: Path) -> None:
@@ -195,9 +213,13 @@ def test_record3d(tmp_path: Path) -> None:
 
 
 def mp4(width: int, height: int) -> bytes:
-    """A track header of sound, which has no size, and one of a picture."""
-    head = lambda w, h: struct.pack(">I4sI", 92, b"tkhd", 0) + b"\0" * 72 + struct.pack(">II", w << 16, h << 16)  # noqa: E731
-    return b"\0\0\0\x18ftypmp42" + head(0, 0) + head(width, height)
+    """A video: pictures that hold the name of a header, and headers of sound, which has no size, and of a picture."""
+
+    def box(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I4s", 8 + len(content), kind) + content
+
+    heads = [box(b"tkhd", b"\0" * 76 + struct.pack(">II", w << 16, h << 16)) for w, h in ((0, 0), (width, height))]
+    return box(b"ftyp", b"mp42") + box(b"mdat", b"tkhd" * 30) + box(b"moov", b"".join(heads))
 
 
 def test_stray_scanner(tmp_path: Path) -> None:
@@ -207,6 +229,10 @@ def test_stray_scanner(tmp_path: Path) -> None:
     (tmp_path / "camera_matrix.csv").write_text("1400.0, 0.0, 958.0\n0.0, 1401.0, 722.0\n0.0, 0.0, 1.0\n")
     with raises(InputError, code="invalid_cameras", match=r"rgb\.mp4"):
         read_cameras(tmp_path)
+    for damaged in (b"", mp4(1920, 1440)[:-90], b"tkhd", mp4(0, 0), b"\xff\xff\xff\xffmoov\xff\xff\xff\xfftkhd"):
+        (tmp_path / "rgb.mp4").write_bytes(damaged)
+        with raises(InputError, code="invalid_cameras", match=r"rgb\.mp4"):
+            read_cameras(tmp_path)
     (tmp_path / "rgb.mp4").write_bytes(mp4(1920, 1440))
     cameras = read_cameras(tmp_path)
     assert (cameras.names, cameras.sizes_px.tolist()) == (("000000",), [[1920, 1440]])
@@ -222,3 +248,23 @@ def test_captures_are_found_with_them(tmp_path: Path) -> None:
         make(tmp_path / name)
     found = {files.cameras.name for files in find_captures([tmp_path]) if files.cameras}
     assert found == {"cameras.xml", "project.opf"}
+
+
+def test_what_only_lies_beside_a_splat_does_not_end_its_ingest(tmp_path: Path) -> None:
+    splat = Gaussians(np.eye(3), np.tile([1.0, 0, 0, 0], (3, 1)), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 1, 3)))
+    far = metashape(component="<transform><translation>4e6 0 0</translation></transform>")
+    foreign = {
+        "book.opf": "<package/>",
+        "cameras.xml": "<rss/>",
+        "metadata.json": '{"poses": [[1]], "K": 1, "w": 1, "h": 1}',
+    }
+    for number, (name, text) in enumerate([*foreign.items(), ("cameras.xml", far)]):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        formats.write(folder / "hall.ply", splat)
+        (folder / name).write_text(text)
+        (capture,) = read_captures([folder])
+        assert capture.cameras.synthesised
+        assert any(name in note for note in capture.notes)
+        with raises(InputError, code=("not_json", "no_cameras", "invalid_cameras", "cameras_see_nothing")):
+            read_captures([folder / "hall.ply"], cameras=folder / name)

@@ -141,8 +141,9 @@ def test_a_drawing_has_the_floor_plan_in_the_crs(tied: Path, site: Site, tmp_pat
     with gsmap.map.open(tied) as m:
         m.export_survey(tmp_path / "plan.geojson", merge="union")
         m.export_survey(tmp_path / "plan.dxf", merge="union")
-        with raises(ConfigError, code="unsupported_crs"):
-            m.export_survey(tmp_path / "plan.dxf", crs="EPSG:4326")
+        for crs in ("EPSG:4326", "EPSG:4979"):
+            with raises(ConfigError, code="unsupported_crs"):
+                m.export_survey(tmp_path / "plan.dxf", crs=crs)
     plan = json.loads((tmp_path / "plan.geojson").read_text())
     drawing = ezdxf.readfile(tmp_path / "plan.dxf")
     assert drawing.units == 6

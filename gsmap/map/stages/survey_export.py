@@ -101,6 +101,12 @@ def export_survey(
     planned = replace(planned, tiles=[tile for tile in planned.tiles if tile.component == component])
     parts = _parts(store, planned, settings, placed, progress)
     system = options.crs or placed.frame.crs
+    is_drawing = out.suffix.lower() == ".dxf"
+    if is_drawing and (here := crs(system)).projected_epsg is None:
+        raise ConfigError(
+            f"a drawing needs a projected CRS with an EPSG code, and {here.text} is none: choose one with --crs",
+            code="unsupported_crs",
+        )
     if kind == "points":
         notes = _write_points(out, parts, placed.frame, system)
     else:
@@ -109,8 +115,8 @@ def export_survey(
         if kind == "orthophoto":
             notes = _write_orthophoto(out, whole, eyes, placed, system, options.pixel_size)
         else:
-            to = WGS84 if out.suffix.lower() == ".geojson" else system
-            notes = _write_floor_plan(out, whole, eyes, placed, to, _footprints(store, planned, placed))
+            footprints = _footprints(store, planned, placed)
+            notes = _write_floor_plan(out, whole, eyes, placed, system if is_drawing else WGS84, footprints)
     of_tiles = world_notes(planned.world, planned.recipe.format, planned.recipe.up)
     return (*(note for note in planned.notes if note not in of_tiles), *notes)
 
@@ -245,12 +251,7 @@ def _write_floor_plan(
     system: str,
     footprints: Iterator[tuple[dict[str, object], Sequence[np.ndarray]]],
 ) -> tuple[str, ...]:
-    here, is_drawing = crs(system), system != WGS84
-    if is_drawing and here.projected_epsg is None:
-        raise ConfigError(
-            f"a drawing needs a projected CRS with an EPSG code, and {here.text} is none: choose one with --crs",
-            code="unsupported_crs",
-        )
+    here, is_drawing = crs(system), out.suffix.lower() == ".dxf"
 
     def in_crs(ring: np.ndarray) -> np.ndarray:
         return from_frame(placed.frame, np.c_[ring, np.zeros(len(ring))], system)[:, :2]
