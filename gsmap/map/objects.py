@@ -240,7 +240,8 @@ def _numbered(store: Store, parts: Sequence[ComponentObjects]) -> list[MapObject
         made |= {part.component: kept.objects for part, kept in zip(new, saved, strict=True)}
     elif new:
         found = [places for part in new for places in part.places or () if places is not None]
-        numbers = iter(store.objects.match_numbers(found))
+        kept = {number for part in parts for thing in part.made.objects if (number := number_of(thing.id)) is not None}
+        numbers = iter(store.objects.match_numbers(found, kept))
         for part in new:
             made[part.component] = [
                 thing if places is None or (number := next(numbers)) is None else replace(thing, id=f"o{number}")

@@ -102,6 +102,7 @@ def update_objects(
     *,
     earlier: Sequence[MapObject] = (),
     changed: Collection[str] | None = None,
+    same: Collection[str] = (),
     touched: Sequence[np.ndarray] = (),
     metres: float = 1.0,
     up: np.ndarray | None = None,
@@ -120,7 +121,8 @@ def update_objects(
         scenes: scenes of the component.
         render: function that renders the views of a scene.
         earlier: objects of an earlier run, in the frame of the scenes.
-        changed: scenes that are new, moved or described anew since; default: all.
+        changed: scenes that are new, moved, described anew or compared otherwise since; default: all.
+        same: of these, scenes whose segments and pose are as they were, so that what they observed still holds.
         touched: boxes (2, 3) around the segments that scenes had at that time and have no more, map frame and unit.
         metres: metres per unit of the map.
         up: (3,) direction against gravity in the map frame; default: z.
@@ -134,7 +136,7 @@ def update_objects(
     changed = set(scenes.order if changed is None else changed)
     if not scenes.order:
         return []
-    known = [_strip(one, scenes, changed) for one in earlier]
+    known = [_strip(one, scenes, changed, same) for one in earlier]
     broken = {i for i, one in enumerate(known) if len(one.members) < sum(s.thing >= 0 for s in earlier[i].sightings)}
     members = [one.members for one in known]
     groups, kept, told = regroup(scenes, members, broken, changed, touched, metres, params.min_overlap, match)
@@ -143,10 +145,11 @@ def update_objects(
         if max(scenes.load(scene).num_members[segment] for scene, segment in group) >= params.min_gaussians:
             objects.append(_new(scenes, group))
     before = {
-        (one.scene, one.asked, known[i].members[one.asked]): one
+        (one.scene, one.asked, expected[one.asked]): one
         for i in set(range(len(known))).difference(kept)
+        for expected in [_members(earlier[i], scenes, changed - set(same))]
         for one in known[i].observations.values()
-        if one.asked in known[i].members
+        if one.asked in expected
     }
     shown: dict[str, list[int]] = {}
     for i, one in enumerate(objects):
@@ -160,11 +163,27 @@ def update_objects(
     return _sorted([_finished(scenes, one, component, level, metres) for one in objects])
 
 
-def _strip(thing: MapObject, scenes: ComponentScenes, changed: Collection[str]) -> _Object:
-    """Return an earlier object without its observations by changed scenes and by scenes that are gone."""
-    stays = {one.scene: one for one in thing.sightings if one.scene in scenes.rank and one.scene not in changed}
-    members = {scene: one.thing for scene, one in stays.items() if one.thing >= 0}
+def _strip(thing: MapObject, scenes: ComponentScenes, changed: Collection[str], same: Collection[str]) -> _Object:
+    """Return an earlier object without its segments in changed scenes, and without observations that no longer hold:
+    by scenes that are gone, and by changed scenes that are not the ``same``.
+    """
+    members = _members(thing, scenes, changed)
+    still = {scene for scene in scenes.rank if scene not in changed or scene in same}
+    stays = {
+        one.scene: one
+        for one in thing.sightings
+        if one.scene in members or (one.thing < 0 and one.scene in still and (one.asked or one.scene not in changed))
+    }
     return _Object(members, stays, thing)
+
+
+def _members(thing: MapObject, scenes: ComponentScenes, changed: Collection[str]) -> dict[str, int]:
+    """Return the segment of an object in each scene that is there and has not changed."""
+    return {
+        one.scene: one.thing
+        for one in thing.sightings
+        if one.thing >= 0 and one.scene in scenes.rank and one.scene not in changed
+    }
 
 
 def _new(scenes: ComponentScenes, group: Group) -> _Object:

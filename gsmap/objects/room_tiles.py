@@ -54,7 +54,8 @@ def update_rooms(
         for y in np.arange(low[1], high[1] + 1)
     }
     touched = sorted(tile for tile in tiles if changed is None or _meets(_window(tile), changed))
-    stay = [room for room in earlier if _tile_of(room) not in touched] if changed is not None else []
+    left = tiles.difference(touched) if changed is not None else set[Tile]()  # tiles without scenes have no rooms
+    stay = [room for room in earlier if _tile_of(room) in left]
     rooms = list(stay)
     doors = [[earlier[other] for other in room.doors] for room in stay]
     for tile in touched:

@@ -45,7 +45,7 @@ def empty_catalog(folder: Path, url: str | None = None, map_id: str = "") -> Cat
         made = open_sqlite_catalog(folder)
     else:
         engine = _catalog.url_engine(url)
-        _require_utf8(engine, folder)
+        _require_utf8(engine)
         if migrate.version(engine, folder) is not None:
             raise StoreError(
                 f"the database {engine.url!r} holds a map already: give each map a database of its own",
@@ -57,11 +57,14 @@ def empty_catalog(folder: Path, url: str | None = None, map_id: str = "") -> Cat
     return made
 
 
-def _require_utf8(engine: Engine, folder: Path) -> None:
+def _require_utf8(engine: Engine) -> None:
     """Raise an error for a database of another encoding; SQLAlchemy fails on its texts, which are bytes."""
     positional, named = engine.dialect.create_connect_args(engine.url)
-    with translate_errors(folder), contextlib.closing(engine.dialect.connect(*positional, **named)) as connection:
-        encoding = connection.info.parameter_status("server_encoding")
+    try:
+        with contextlib.closing(engine.dialect.connect(*positional, **named)) as connection:
+            encoding = connection.info.parameter_status("server_encoding")
+    except engine.dialect.loaded_dbapi.Error:
+        return  # a server that cannot be reached is reported by the first query
     if encoding != "UTF8":
         raise ConfigError(
             f"the database {engine.url!r} has the encoding {encoding}, but a catalog needs UTF8: create it with "

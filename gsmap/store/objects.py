@@ -194,11 +194,15 @@ class Objects:
                     box = from_array(here[share.argmax()])
                     connection.execute(update(object_places).where(same).values(box=box))
 
-    def match_numbers(self, places: Sequence[ObjectBoxes]) -> list[int | None]:
-        """Find the numbers of objects by their boxes, without storing anything; None for unknown objects."""
+    def match_numbers(self, places: Sequence[ObjectBoxes], taken: Collection[int] = ()) -> list[int | None]:
+        """Find the numbers of objects by their boxes, without storing anything; None for unknown objects.
+
+        Args:
+            taken: numbers of objects that keep theirs.
+        """
         captures = {scene for one in places for scene in one}
         with self._catalog.read() as connection:
-            return match_objects(connection, places, _numbers_in_use(connection, besides=captures))
+            return match_objects(connection, places, _numbers_in_use(connection, besides=captures).union(taken))
 
     def split_objects(self, components: Mapping[int, int], scenes: Mapping[str, int]) -> dict[int, int]:
         """Return pairs of objects that were one before their component was split, as a mapping between their numbers.

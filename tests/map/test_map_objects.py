@@ -223,6 +223,21 @@ def test_objects_are_the_same_whatever_the_unit_of_the_map(site: Map) -> None:
     np.testing.assert_allclose(box_m, 10 * box)
 
 
+@pytest.mark.guards("answers")
+def test_another_order_of_captures_gives_the_objects_of_that_order(site: Map, tmp_path: Path) -> None:
+    with gsmap.map.open(site.clone(tmp_path / "order.gsmap").path) as m:
+        m.objects()
+        m.edit("july", captured_at="2020-01-01")
+        updated = m.objects().objects
+        with m.store.catalog.write() as connection:
+            connection.execute(delete(schema.object_sets))
+        whole = {row.id: row for row in m.objects().objects}
+        assert {row.id for row in updated} == set(whole)
+        for row in updated:
+            np.testing.assert_allclose(row.position, whole[row.id].position, atol=1e-9)
+            assert row.seen == whole[row.id].seen
+
+
 def test_objects_of_a_component_that_comes_apart_have_numbers_of_their_own(site: Map, tmp_path: Path) -> None:
     with gsmap.map.open(site.clone(tmp_path / "clone.gsmap").path) as m:
         before = {row.id for row in m.objects().objects}

@@ -1,6 +1,7 @@
 """Objects and rooms of a street: a scene that comes or goes leaves what a computation from scratch finds."""
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from gsmap.objects import (
     update_objects,
     update_rooms,
 )
-from gsmap.types import MapObject, Segments, Sim3
+from gsmap.types import MapObject, ObjectObservation, Segments, Sim3
 from gsmap.types.room import Room
 
 STEP_M, REACH_M, NUM = 3.0, 4.0, 14
@@ -157,3 +158,36 @@ def test_a_new_room_segments_only_the_tiles_around_it():
     assert plan(updated) == plan(rooms(range(30)))
     assert min(loaded) > 12
     assert plan(rooms(range(30), updated, [])) == plan(updated)
+
+
+@pytest.mark.guards("answers")
+def test_rooms_of_a_scene_that_goes_go_with_it():
+    """Four buildings 40 m apart; the last one leaves tiles without a scene."""
+    there, left = [0, 8, 16, 24], [0, 8, 16]
+    updated = rooms(left, rooms(there), [24])
+    assert plan(updated) == plan(rooms(left))
+    assert len(plan(updated)) == 3
+
+
+@pytest.mark.guards("answers")
+def test_a_scene_that_is_only_compared_again_keeps_what_it_observed():
+    """Even where it cannot be searched any more, as a thinned scene."""
+    objects = make_objects([segmented(k) for k in range(6)], 0, lambda _: NOTHING)
+    watcher = "s04"
+    places = {i for i, one in enumerate(objects) if all(s.scene != watcher for s in one.sightings)}
+    told = [
+        replace(
+            one, sightings=(*one.sightings, ObjectObservation(watcher, "absent", -1, None, 0.5, one.sightings[0].scene))
+        )
+        if i in places
+        else one
+        for i, one in enumerate(objects)
+    ]
+    scenes = street(range(6))
+    without_view = replace(scenes, views={scene: view for scene, view in scenes.views.items() if scene != watcher})
+    for same, found in (([watcher], len(places)), ([], 0)):
+        updated = update_objects(
+            without_view, 0, lambda _: NOTHING, earlier=told, changed=[watcher], same=same, touched=[]
+        )
+        assert groups(updated) == groups(objects)
+        assert sum(s.state == "absent" for one in updated for s in one.sightings) == found

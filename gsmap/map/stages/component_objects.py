@@ -135,17 +135,18 @@ class _Update:
         old, wanted = self._earlier, self.wanted
         things = {scene: self._digest(scene) for scene in wanted.poses}
         changed = self._changed(things)
+        same = {scene for scene in changed if self._is_same(scene, things)}  # but what is known of them changed
         shown = [scene for scene in wanted.poses if things[scene]]
         boxes = {scene: old.boxes[scene] for scene in shown if scene in old.boxes and scene not in changed}
-        views = {scene: old.views[scene] for scene in shown if scene in old.views and scene not in changed}
+        views = {scene: old.views[scene] for scene in shown if scene in old.views and scene not in changed - same}
         for scene in shown:
             if scene in changed:
-                box, view = self._load(scene).box, self._view_box(scene)
+                box, view = self._load(scene).box, None if scene in views else self._view_box(scene)
                 boxes |= {} if box is None else {scene: box}
                 views |= {} if view is None else {scene: view}
         up = self._up()
         scenes = ComponentScenes(shown, self._load, boxes, views)
-        objects = self._update_objects(scenes, changed, up, progress)
+        objects = self._update_objects(scenes, changed, same, up, progress)
         rooms, surfaces = list[Room](), dict[str, np.ndarray]()
         if self.key is not None:
             progress(1.0, "rooms")
@@ -180,7 +181,8 @@ class _Update:
             for one in self.sets
             if one.recipe == self.key.recipe and abs(one.metres / self.wanted.unit - 1) <= _MAX_UNIT_CHANGE
         ]
-        return max(usable, key=lambda one: len(self._unmoved(one)), default=none)
+        found = max(usable, key=lambda one: len(self._unmoved(one)), default=none)
+        return found if self._unmoved(found) else none
 
     def _unmoved(self, old: ObjectSet) -> dict[str, Sim3]:
         return unmoved_poses(old.poses, self.wanted.poses, self.wanted.scenes, self.wanted.unit)
@@ -200,18 +202,29 @@ class _Update:
         return "" if found is None else text_digest(found.segments.extents.tobytes().hex())
 
     def _changed(self, things: Mapping[str, str]) -> set[str]:
-        """Return the scenes that are new, moved, described anew or compared otherwise."""
+        """Return the scenes that are new, moved, described anew or compared otherwise; all if their order changed."""
         old, new = self._earlier, self.wanted.told
-        changed = {s for s in things if self._poses[s] is not old.poses.get(s) or things[s] != old.things[s]}
+        if [s for s in old.things if s in things] != [s for s in things if s in old.things]:
+            return set(things)
+        changed = {s for s in things if not self._is_same(s, things)}
         for pair in old.told.keys() | new.keys():
             if old.told.get(pair) != new.get(pair):
                 changed.update(scene for scene in pair.split(":") if scene in things)
         return changed
 
+    def _is_same(self, scene: str, things: Mapping[str, str]) -> bool:
+        """Return True if a scene lies where it was and has the segments that it had."""
+        return self._poses[scene] is self._earlier.poses.get(scene) and things[scene] == self._earlier.things[scene]
+
     # --- objects -----------------------------------------------------------------------------------------------------
 
     def _update_objects(
-        self, scenes: ComponentScenes, changed: Collection[str], up: np.ndarray, progress: Progress
+        self,
+        scenes: ComponentScenes,
+        changed: Collection[str],
+        same: Collection[str],
+        up: np.ndarray,
+        progress: Progress,
     ) -> list[MapObject]:
         """Associate and observe objects, some neighbouring scenes after the other."""
         left = [old for scene, old in self._earlier.boxes.items() if scene in changed or scene not in scenes.boxes]
@@ -233,6 +246,7 @@ class _Update:
                 self._render,
                 earlier=objects,
                 changed=part,
+                same=same,
                 touched=() if done else left,
                 metres=self.wanted.unit,
                 up=up,
@@ -250,6 +264,8 @@ class _Update:
         return tuple(np.floor(middle * self.wanted.unit / _BLOCK_M).astype(int).tolist())
 
     def _in_frustum(self, capture: SegmentedScene, points: np.ndarray) -> bool:
+        if self.wanted.scenes[capture.scene].thinning is not None:
+            return False  # what is left of it does not show what its cameras saw; earlier observations stay
         return is_in_view(self._cameras_of(capture.scene), points, self.settings.objects.max_views)
 
     def _render(self, capture: SegmentedScene) -> RenderedViews:
@@ -341,7 +357,7 @@ class _Update:
         """Return the rooms, and the box (2, 3) of each scene's surfaces, in the level frame of ``up``, in metres."""
         old = self._earlier
         S_level_map = Sim3(level_frame(up), np.zeros(3), self.wanted.unit)
-        earlier = dict(old.surfaces) if up is old.up else {}
+        earlier = dict(old.surfaces) if up is old.up and old.metres == self.wanted.unit else {}  # both are in metres
         boxes = {scene: earlier[scene] for scene in self._poses if scene in earlier and scene not in changed}
         new = [scene for scene in self._poses if scene not in earlier or scene in changed]
         for scene in new:
