@@ -54,6 +54,7 @@ class SceneRender:
         T_metric_camera: (4, 4) camera-to-component, metres.
         intrinsics_px: (4,) intrinsics at this size.
         displacement: (R, C, 2) displacement map (`gsmap.localize.displacement`), or None.
+        displaced_at: the earlier render for whose camera the displacement map was computed; None for this one.
     """
 
     scene: str
@@ -65,6 +66,7 @@ class SceneRender:
     T_metric_camera: np.ndarray
     intrinsics_px: np.ndarray
     displacement: np.ndarray | None = None
+    displaced_at: SceneRender | None = None
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -145,11 +147,12 @@ def render_scenes(
         rgb = np.clip(np.nan_to_num(rendered.colour[0]), 0, 1)
         depth = rendered.depth[0] * np.float32(one.S_metric_scene.scale)
         smooth = features.smooth_depth(rendered) > 0
-        moved = None
+        moved, at = None, None
         if with_displacement:
-            moved = _displacement_map(one, T_metric_camera, intrinsics_px, size_px, previous)
+            moved, at = _displacement_map(one, T_metric_camera, intrinsics_px, size_px, previous)
         alpha = rendered.alpha[0]
-        out.append(SceneRender(one.scene, rgb, rgb @ GREY, alpha, depth, smooth, T_metric_camera, intrinsics_px, moved))
+        camera_of = T_metric_camera, intrinsics_px
+        out.append(SceneRender(one.scene, rgb, rgb @ GREY, alpha, depth, smooth, *camera_of, moved, at))
     return out
 
 
@@ -159,15 +162,15 @@ def _displacement_map(
     intrinsics_px: np.ndarray,
     size_px: tuple[int, int],
     previous: Sequence[SceneRender],
-) -> np.ndarray:
-    """Return the displacement map of a render, or that of a previous render whose content moved little.
+) -> tuple[np.ndarray, SceneRender | None]:
+    """Return the displacement map of a render, or that of a previous render whose content moved little, and that one.
 
     A map is a mean over windows, so that it hardly changes if the content moves by a fraction of their width.
     """
-    for one in previous:
+    for one in (render.displaced_at or render for render in previous):
         if one.scene == scene.scene and one.displacement is not None:
             larger = max(size_px) / max(one.size_px)
             limit = _MAX_MOTION_WINDOWS * displacement.WINDOW_PX * max(one.size_px) / 480
             if one.motion_px(T_metric_camera, intrinsics_px / larger) <= limit:
-                return one.displacement * np.float32(larger)
-    return displacement.displacement_map(scene, T_metric_camera, intrinsics_px, size_px)
+                return one.displacement * np.float32(larger), one
+    return displacement.displacement_map(scene, T_metric_camera, intrinsics_px, size_px), None
