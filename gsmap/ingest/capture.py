@@ -13,7 +13,6 @@ import numpy as np
 
 from gsmap import formats
 from gsmap.errors import ConfigError, GsmapError, InputError, NotPinholesError
-from gsmap.formats.cameras import is_of_trainer
 from gsmap.formats.precision import about_origin, format_origin, rounded_to
 from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.transforms import transform_cameras
@@ -105,6 +104,8 @@ def read_capture(
     bbox: Sequence[float] | None = None,
 ) -> Capture:
     """Read and check a capture from `find_captures`; see `read_captures` and `take_capture`."""
+    from gsmap.formats.cameras import is_of_trainer  # imported here, as verbs that read no file do not need it
+
     given_date(captured_at)  # refuses what is none before a large file is read
     gaussians = formats.stream(found.path)
     about = formats.info(found.path)
