@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 from gsmap.errors import MALFORMED, GsmapError, InputError
@@ -54,7 +53,7 @@ def read(path: str | os.PathLike[str]) -> Cameras:
     """
     path = Path(path)
     try:
-        return _reader(path)()
+        return _read(path)
     except OSError as error:
         raise InputError(
             f"cannot read cameras from {path}: {error.strerror or error}", code="file_unreadable"
@@ -66,30 +65,30 @@ def read(path: str | os.PathLike[str]) -> Cameras:
         raise InputError(f"{path} is not a camera file: {what}", code="invalid_cameras") from error
 
 
-def _reader(path: Path) -> Callable[[], Cameras]:
+def _read(path: Path) -> Cameras:
     if path.is_dir():
         if (model := colmap.find_model(path)) is not None:
-            return lambda: colmap.read(model)
+            return colmap.read(model)
         found = find(path)
         if found is None and path.name in {name.rpartition("/")[2] for name in phone_scans.POLYCAM}:
-            return lambda: phone_scans.read_polycam(path)
+            return phone_scans.read_polycam(path)
         if found is None:
             raise InputError(
                 f"{path} holds no cameras: the folder has no COLMAP model (cameras.bin/.txt), no transforms.json, no "
                 "cameras.xml of Metashape, no .opf project and no scan of Polycam, Record3D or Stray Scanner",
                 code="no_cameras",
             )
-        return (lambda: phone_scans.read_stray(path)) if found == path else _reader(found)
+        return phone_scans.read_stray(path) if found == path else _read(found)
     if path.suffix.lower() == ".xml":
-        return lambda: metashape.read(path)
+        return metashape.read(path)
     if path.suffix.lower() == ".opf":
-        return lambda: opf.read(path)
+        return opf.read(path)
     content = load_json(path)
     if isinstance(content, list):
-        return lambda: cameras_json.parse(content, path)
+        return cameras_json.parse(content, path)
     if "poses" in content and "K" in content:
-        return lambda: phone_scans.parse_record3d(content, path)
-    return lambda: nerfstudio.parse(content, path)
+        return phone_scans.parse_record3d(content, path)
+    return nerfstudio.parse(content, path)
 
 
 def _is_record3d(path: Path) -> bool:

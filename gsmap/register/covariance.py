@@ -394,13 +394,13 @@ def _pull(target: Surface, points: np.ndarray, oriented: np.ndarray | None, cent
     normals = target.normals[row[hit]]
     residual = (normals * (moved[hit] - target.coarse[0][row[hit]])).sum(1)
     slope = point_to_plane_jacobian(centred, points[hit] - centre.translation, normals)
-    pull: np.ndarray = (_weights(residual) * residual) @ slope
+    pull: np.ndarray = (robust_weights(residual) * residual) @ slope
     return pull
 
 
-def _weights(residual: np.ndarray) -> np.ndarray:
-    """Return the Geman-McClure weights of residuals."""
-    weights: np.ndarray = 1.0 / (1.0 + (residual / (_WIDTH * RADIUS_M)) ** 2) ** 2
+def robust_weights(residual: np.ndarray, scale_m: float = _WIDTH * RADIUS_M) -> np.ndarray:
+    """Return the Geman-McClure weights of residuals; a residual of ``scale_m`` has a quarter of the full weight."""
+    weights: np.ndarray = 1.0 / (1.0 + (residual / scale_m) ** 2) ** 2
     return weights
 
 
@@ -464,7 +464,7 @@ class PairBlocks:
         axis = np.abs(normals).argmax(1)
         normals = normals * np.sign(normals[np.arange(len(normals)), axis])[:, None]
         residual = (normals * (moved - target.coarse[0][row[hit]])).sum(1)
-        weights = _weights(residual)
+        weights = robust_weights(residual)
         centroid = points.mean(0)
         jacobian = point_to_plane_jacobian(pose, points, normals) @ np.linalg.inv(_shift(centroid))
         size, labels = BLOCK_M, _labels(moved, axis, BLOCK_M)

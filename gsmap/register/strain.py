@@ -9,7 +9,13 @@ import numpy as np
 from gsmap.geometry.chi_square import chi2_log_survival
 from gsmap.geometry.rotations import retract
 from gsmap.register import error_field
-from gsmap.register.covariance import PairBlocks, PoseUncertainty, oriented_normals, point_to_plane_jacobian
+from gsmap.register.covariance import (
+    PairBlocks,
+    PoseUncertainty,
+    oriented_normals,
+    point_to_plane_jacobian,
+    robust_weights,
+)
 from gsmap.register.surface import Surface
 from gsmap.types import Sim3
 
@@ -119,7 +125,7 @@ def fit_strain(target: Surface, source: Surface, pose: Sim3) -> Strain | None:
         hit = np.isfinite(distance) & (np.linalg.norm(apart - residual[:, None] * plane, axis=1) < border_m)
         if hit.sum() < _MIN_PAIRS:
             return None
-        weights = 1.0 / (1.0 + (residual[hit] / max(radius / 3.0, 0.02)) ** 2) ** 2
+        weights = robust_weights(residual[hit], max(radius / 3.0, 0.02))
         J = np.concatenate(
             [point_to_plane_jacobian(pose @ centre, warped[hit], plane[hit]), _strains(pose, local[hit], plane[hit])],
             axis=1,
@@ -130,15 +136,17 @@ def fit_strain(target: Surface, source: Surface, pose: Sim3) -> Strain | None:
         pose = retract(pose @ centre, step[:7]) @ centre.inverse()
         strain = strain + step[7:]
     matrix = np.einsum("k,kij->ij", strain, _MODES)
-    points, _ = source.coarse
     blocks = PairBlocks.of(target, source, pose, points + (points - centroid) @ matrix)
-    if blocks is None or (covariance := _covariance(blocks, pose)) is None:
+    if blocks is None:
+        return None
+    J = _jacobian(blocks, pose)
+    if (covariance := _covariance(blocks, J)) is None:
         return None
     statistic = float(strain @ np.linalg.pinv(covariance, hermitian=True) @ strain)
     inside = local[np.linalg.norm(local, axis=1) < radius_m]
     rms_m = float(np.sqrt(((inside @ matrix) ** 2).sum(1).mean())) if len(inside) else 0.0
     log10_p = float(chi2_log_survival(statistic, 5)) / np.log(10.0)
-    return Strain(matrix, log10_p, _observability(blocks, pose, strain), rms_m, centroid, radius_m)
+    return Strain(matrix, log10_p, _observability(blocks, J, strain), rms_m, centroid, radius_m)
 
 
 def _strains(pose: Sim3, local: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -158,9 +166,8 @@ def _jacobian(blocks: PairBlocks, pose: Sim3) -> np.ndarray:
     return np.concatenate([blocks.jacobian, _strains(pose, local, blocks.directions)], axis=1)
 
 
-def _covariance(blocks: PairBlocks, pose: Sim3) -> np.ndarray | None:
-    """Return the (5, 5) covariance of a strain; None where there are too few blocks."""
-    J = _jacobian(blocks, pose)
+def _covariance(blocks: PairBlocks, J: np.ndarray) -> np.ndarray | None:
+    """Return the (5, 5) covariance of a strain by the Jacobian (B, 12); None where there are too few blocks."""
     pull = (J * blocks.weights[:, None]).T
     influence = np.linalg.pinv(pull @ J, hermitian=True) @ pull
     seen = error_field.Blocks(J, blocks.residual, blocks.positions, blocks.directions, blocks.counts)
@@ -168,8 +175,7 @@ def _covariance(blocks: PairBlocks, pose: Sim3) -> np.ndarray | None:
     return None if errors is None else errors.covariance[7:, 7:]
 
 
-def _observability(blocks: PairBlocks, pose: Sim3, strain: np.ndarray) -> float:
-    J = _jacobian(blocks, pose)
+def _observability(blocks: PairBlocks, J: np.ndarray, strain: np.ndarray) -> float:
     H = (J * blocks.weights[:, None]).T @ J
     left = H[7:, 7:] - H[7:, :7] @ np.linalg.pinv(H[:7, :7], hermitian=True) @ H[:7, 7:]
     whole = float(strain @ strain) * blocks.weights.sum() * blocks.radius_m**2
