@@ -102,23 +102,31 @@ def export_survey(
     parts = _parts(store, planned, settings, placed, progress)
     system = options.crs or placed.frame.crs
     is_drawing = out.suffix.lower() == ".dxf"
-    if is_drawing and (here := crs(system)).projected_epsg is None:
-        raise ConfigError(
-            f"a drawing needs a projected CRS with an EPSG code, and {here.text} is none: choose one with --crs",
-            code="unsupported_crs",
-        )
+    if kind == "orthophoto" or is_drawing:
+        epsg = _projected_epsg(system, "a drawing" if is_drawing else "an orthophoto")
     if kind == "points":
         notes = _write_points(out, parts, placed.frame, system)
     else:
         eyes = _eyes(store, planned, placed)
         whole = Gaussians.concatenate(list(parts))
         if kind == "orthophoto":
-            notes = _write_orthophoto(out, whole, eyes, placed, system, options.pixel_size)
+            notes = _write_orthophoto(out, whole, eyes, placed, system, epsg, options.pixel_size)
         else:
             footprints = _footprints(store, planned, placed)
             notes = _write_floor_plan(out, whole, eyes, placed, system if is_drawing else WGS84, footprints)
     of_tiles = world_notes(planned.world, planned.recipe.format, planned.recipe.up)
     return (*(note for note in planned.notes if note not in of_tiles), *notes)
+
+
+def _projected_epsg(system: str, what: str) -> int:
+    """Return the EPSG code of a CRS; raise an error for one without eastings and northings, before scenes are read."""
+    here = crs(system)
+    if here.projected_epsg is None:
+        raise ConfigError(
+            f"{what} needs a projected CRS with an EPSG code, and {here.text} is none: choose one with --crs",
+            code="unsupported_crs",
+        )
+    return here.projected_epsg
 
 
 def _component(planned: ExportPlan, wanted: int | None) -> tuple[int, GeoreferencedComponent]:
@@ -185,16 +193,11 @@ def _write_orthophoto(
     eyes: np.ndarray,
     placed: GeoreferencedComponent,
     system: str,
+    epsg: int,
     pixel: float | None,
 ) -> tuple[str, ...]:
     """Write an orthophoto with pixels of ``pixel`` units of the CRS; None selects their size."""
     here = crs(system)
-    epsg = here.projected_epsg
-    if epsg is None:
-        raise ConfigError(
-            f"an orthophoto needs a projected CRS with an EPSG code, and {here.text} is none: choose one with --crs",
-            code="unsupported_crs",
-        )
     shown, note = _below_ceiling(whole, eyes)
     corners = robust_box(shown.means.astype(np.float64), outside=0.002)
     box = np.array([[x, y, 0.0] for x in corners[:, 0] for y in corners[:, 1]])
