@@ -18,7 +18,6 @@ from gsmap.types.cameras import CameraModel
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-_RADIAL = ("k1", "k2", "k3", "k4")
 _MAX_BYTES = 1 << 28
 _LOCAL = ("", "LOCAL_CS", "ENGCRS")  # coordinate systems whose metres are those of the exports
 
@@ -110,7 +109,7 @@ def _model(sensor: Element) -> CameraModel | str:
     values = {part.tag: _numbers(part.text)[0] for part in calibration if part.tag != "resolution" and part.text}
     f, b1 = values["f"], values.get("b1", 0.0)
     middle = (f + b1, f, width / 2 + values.get("cx", 0.0), height / 2 + values.get("cy", 0.0))
-    k1, k2, k3, k4 = (values.get(name, 0.0) for name in _RADIAL)
+    k1, k2, k3, k4 = (values.get(name, 0.0) for name in ("k1", "k2", "k3", "k4"))
     p1, p2 = values.get("p2", 0.0), values.get("p1", 0.0)  # in OpenCV's order
     odd = [name for name in ("b2", "p3", "p4") if values.get(name)]
     if kind == "fisheye" and not (odd or p1 or p2):

@@ -17,6 +17,7 @@ _OPENGL = np.array([1.0, -1.0, -1.0])  # right-up-back camera axes in terms of r
 POLYCAM = ("keyframes/corrected_cameras", "keyframes/cameras")
 STRAY = ("odometry.csv", "camera_matrix.csv")
 _MAX_MOVIE_BYTES = 1 << 26  # of the index of a video
+_MAX_BOXES = 10_000  # before the index of a video; a crafted file could hold millions
 
 
 def read_polycam(folder: Path) -> Cameras:
@@ -111,7 +112,10 @@ def _video_size(path: Path) -> tuple[int, int]:
 def _movie_box(path: Path) -> bytes:
     """Return the content of the box ``moov`` of an MP4; empty without one of a plausible size."""
     with open(path, "rb") as file:
-        while len(head := file.read(8)) == 8:
+        for _ in range(_MAX_BOXES):
+            head = file.read(8)
+            if len(head) < 8:
+                break
             size, kind, skipped = int.from_bytes(head[:4], "big"), head[4:], 8
             if size == 1:
                 size, skipped = int.from_bytes(file.read(8), "big"), 16
