@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmap._native import laid as native_normal_equations
+from gsmap.geometry.filters import blur, box_means, gradients
 from gsmap.localize import resection
 from gsmap.localize.candidate_renders import SceneRender
-from gsmap.localize.filters import blur, box_means, gradients
 
 BLUR_PX = (8.0, 4.0, 2.0)
 """Standard deviation of the blur in each round, in pixels of a photo of 480 pixels."""

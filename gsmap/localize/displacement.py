@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmap.geometry.filters import box_means
 from gsmap.geometry.projection import project
-from gsmap.localize.filters import box_means
 from gsmap.localize.map_scene import MapScene
 
 FRACTION = 0.16

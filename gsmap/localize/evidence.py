@@ -8,8 +8,8 @@ from functools import partial
 
 import numpy as np
 
+from gsmap.geometry.filters import box_means
 from gsmap.localize.candidate_renders import GREY, SceneRender, downsample, downsample_mask
-from gsmap.localize.filters import box_means
 from gsmap.localize.mismatch import MismatchMap
 
 HALF_PX = 8

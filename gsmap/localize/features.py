@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmap.geometry.filters import maximum, minimum
 from gsmap.localize import views
-from gsmap.localize.filters import maximum, minimum
 from gsmap.methods.extractor import Extractor
 from gsmap.render import ChunkIndex, Rendering, render
 from gsmap.types import Cameras, Gaussians

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
+from gsmap.geometry.filters import blur
 from gsmap.geometry.projection import in_image, project
 from gsmap.localize import covariance, evidence, feature_frames, matching, mismatch, probability, resection, verdict
 from gsmap.localize.candidate_renders import GREY, sample_mask
 from gsmap.localize.candidates import PoseCandidate, is_duplicate, match_views, propose_poses
 from gsmap.localize.features import quantize, quantize_angles
-from gsmap.localize.filters import blur
 from gsmap.localize.map_scene import MapScene
 from gsmap.localize.params import Params
 from gsmap.localize.refinement import RefinedPose, ScaledPhoto, refine_pose

@@ -18,8 +18,8 @@ import numpy as np
 from scipy.ndimage import binary_dilation, label
 
 from gsmap.compare.colours import balance
+from gsmap.geometry.filters import blur, box_means
 from gsmap.localize.candidate_renders import GREY, SceneRender, downsample, downsample_mask
-from gsmap.localize.filters import blur, box_means
 
 MISMATCH_PROBABILITY = 0.5
 """A cell with at least this probability counts as a mismatch."""

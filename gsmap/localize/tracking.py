@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-from gsmap.localize.filters import blur, box_means, gradients, maximum
+from gsmap.geometry.filters import blur, box_means, gradients, maximum
 
 MAX_PATCHES = 400
 """Number of patches of one render: those with most structure."""

@@ -7,7 +7,8 @@ import pytest
 from scipy import ndimage
 
 from gsmap.geometry.rotations import exp_so3
-from gsmap.localize import direct_alignment, filters, resection
+from gsmap.geometry import filters
+from gsmap.localize import direct_alignment, resection
 
 
 @pytest.mark.parametrize("shape", [(37, 53), (9, 70, 3), (1, 5), (40, 2, 2)])

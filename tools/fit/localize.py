@@ -40,6 +40,7 @@ from PIL import Image
 from scipy.optimize import minimize
 
 from gsmap.compare.odds import Curve, Odds
+from gsmap.geometry.filters import box_means
 from gsmap.geometry.similarities import rotation_vectors
 from gsmap.ingest import read_captures
 from gsmap.localize import (
@@ -62,7 +63,6 @@ from gsmap.localize import (
 from gsmap.localize.candidate_renders import GREY, downsample, render_scenes
 from gsmap.localize.candidates import PoseCandidate, match_views, propose_poses
 from gsmap.localize.features import INDEXED_FEATURES
-from gsmap.localize.filters import box_means
 from gsmap.localize.map_scene import MapScene
 from gsmap.localize.params import Params
 from gsmap.localize.resection import retract_pose

@@ -12,8 +12,10 @@ from gsmap._native import slopes as native_slopes
 from gsmap._native import smoothed
 
 
-def blur(image: np.ndarray, sigma_px: float, truncate: float = 4.0, *, reflect: bool = True) -> np.ndarray:
-    """Convolve an image with a Gaussian.
+def blur(
+    image: np.ndarray, sigma_px: float, truncate: float = 4.0, *, reflect: bool = True, step: int = 1
+) -> np.ndarray:
+    """Convolve an image with a Gaussian; return the pixels ``[::step, ::step]``.
 
     Args:
         truncate: radius of the kernel in standard deviations.
@@ -21,7 +23,7 @@ def blur(image: np.ndarray, sigma_px: float, truncate: float = 4.0, *, reflect: 
     """
     reach = int(truncate * sigma_px + 0.5)
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
-    return _convolve(image, weights / weights.sum(), reflect)
+    return _convolve(image, weights / weights.sum(), reflect, step=step)
 
 
 def box_means(image: np.ndarray, size_px: int, *, reflect: bool = True, first: int = 0, step: int = 1) -> np.ndarray:
