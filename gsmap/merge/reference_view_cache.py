@@ -303,12 +303,14 @@ def _box_of(view: Cameras, depth: np.ndarray) -> np.ndarray:
     return np.array([low, high])
 
 
-def surface_axes(camera: Cameras, depth: np.ndarray) -> list[np.ndarray]:
-    """Return x, y and z, each (H, W) float32, of the points of a depth image in the frame of the camera's pose."""
+def surface_axes(camera: Cameras, depth: np.ndarray, step: int = 1) -> list[np.ndarray]:
+    """Return x, y and z, each (H, W) float32, of the points of a depth image in the frame of the camera's pose; with a
+    ``step`` those of its pixels ``[::step, ::step]``."""
     height, width = depth.shape
     fx, fy, cx, cy = camera.intrinsics_px[0]
-    x = (np.arange(width) + 0.5 - cx) / fx
-    y = (np.arange(height) + 0.5 - cy) / fy
+    x = (np.arange(0, width, step) + 0.5 - cx) / fx
+    y = (np.arange(0, height, step) + 0.5 - cy) / fy
+    depth = depth[::step, ::step]
     T = camera.T_frame_camera[0]
     axes = []
     for axis in range(3):

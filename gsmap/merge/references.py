@@ -246,25 +246,28 @@ def _count(
 ) -> None:
     """Add the pixels that each Gaussian dominates to ``pixels``, undisputed ones to ``sure``; update ``largest``."""
     dominant = seen.dominant_id[0]
-    pixels += np.bincount(dominant[dominant >= 0], minlength=len(pixels))
-    undisputed = dominant >= 0 if disputed is None else (dominant >= 0) & ~disputed
-    sure += np.bincount(dominant[undisputed], minlength=len(pixels))
+    shown = np.bincount(dominant[dominant >= 0], minlength=len(pixels))
+    pixels += shown
+    if disputed is not None:
+        shown = np.bincount(dominant[(dominant >= 0) & ~disputed], minlength=len(pixels))
+    sure += shown
     np.maximum(largest, seen.max_weight, out=largest)
 
 
 def _coarse_points(camera: Cameras, depth: np.ndarray) -> np.ndarray:
     """Return the (h, w, 3) float32 surface points of every `_STRIDE_PX`-th pixel of a depth image."""
-    return np.stack([axis[::_STRIDE_PX, ::_STRIDE_PX] for axis in surface_axes(camera, depth)], axis=-1)
+    return np.stack(surface_axes(camera, depth, _STRIDE_PX), axis=-1)
 
 
 def _apply(weights: np.ndarray, coarse: np.ndarray) -> float:
     """Multiply the uint8 pixel weights (H, W) of a view in place by factors of every `_STRIDE_PX`-th pixel; return the
     ratio of the sums after and before."""
     height, width = weights.shape
-    rows, columns = np.arange(height) // _STRIDE_PX, np.arange(width) // _STRIDE_PX
-    before = weights.sum(dtype=np.float64)
-    weights[:] = np.round(weights * coarse[np.ix_(rows, columns)])
-    return float(weights.sum(dtype=np.float64) / max(before, 1))
+    before = weights.sum(dtype=np.int64)
+    fine = coarse.astype(np.float32).repeat(_STRIDE_PX, 0)[:height].repeat(_STRIDE_PX, 1)[:, :width]
+    fine *= weights
+    weights[:] = np.rint(fine, out=fine)
+    return float(weights.sum(dtype=np.int64) / max(before, 1))
 
 
 def _window(counts: np.ndarray) -> tuple[slice, slice]:

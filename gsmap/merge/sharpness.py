@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gsmap.geometry.filters import blur
 from gsmap.merge.overlap import share_in_view
 from gsmap.merge.reference_view_cache import surface_axes
 from gsmap.render import ChunkIndex, render
@@ -55,20 +56,21 @@ class SharpnessComparison:
             depth: (H, W) depth of the scene's surface.
             valid: (H, W) mask of pixels that are compared.
         """
-        used = np.zeros_like(valid)
-        used[::_STRIDE_PX, ::_STRIDE_PX] = valid[::_STRIDE_PX, ::_STRIDE_PX]
-        own, depths = _detail(colour)[used], depth[used]
-        cells = _cells(np.stack([axis[used] for axis in surface_axes(camera, depth)], axis=-1))
+        few = slice(None, None, _STRIDE_PX), slice(None, None, _STRIDE_PX)
+        used = valid[few]
+        own, depths = _detail(colour)[used], depth[few][used]
+        cells = _cells(np.stack([axis[used] for axis in surface_axes(camera, depth, _STRIDE_PX)], axis=-1))
         for other, piece in enumerate(self.pieces):
             if other == scene or not len(piece) or not share_in_view(camera, piece.means)[0]:
                 continue
             seen = render(piece, camera, dominant_id=False, index=self.indices[other])
-            same = np.abs(seen.depth[0][used] - depths) < _MAX_DEPTH_RATIO * depths
-            same &= seen.alpha[0][used] > _MIN_ALPHA
+            same = np.abs(seen.depth[0][few][used] - depths) < _MAX_DEPTH_RATIO * depths
+            same &= seen.alpha[0][few][used] > _MIN_ALPHA
             if same.sum() < _MIN_PIXELS:
                 continue
             theirs = np.clip(seen.colour[0], 0, 1)
-            exposure = colour[used][same].mean() / max(float(theirs[used][same].mean()), 1e-3)
+            mean = float(theirs[few][used][same].mean())
+            exposure = float(colour[few][used][same].mean()) / max(mean, 1e-3)
             detail = exposure * _detail(theirs)[used][same]
             values = np.ones(len(detail)), (own[same] * detail).sum(1), (own[same] ** 2).sum(1)
             where, label = np.unique(cells[same], return_inverse=True)
@@ -111,14 +113,17 @@ class SharpnessWeights:
         if scene not in self.of_scene:
             return np.ones(points.shape[:-1])
         known, weights = self.of_scene[scene]
-        total, count = np.zeros(points.shape[:-1]), np.zeros(points.shape[:-1])
-        for corner in np.ndindex(2, 2, 2):
-            cells = _cells(points + (np.array(corner) - 0.5) * _CELL_M)
+        lowest = _cells(points - _CELL_M / 2)
+        near = np.unique(lowest)  # most points share a few cells
+        total, count = np.zeros(len(near)), np.zeros(len(near))
+        for x, y, z in np.ndindex(2, 2, 2):
+            cells = near + (x << 42) + (y << 21) + z
             at = np.minimum(np.searchsorted(known, cells), len(known) - 1)
             found = known[at] == cells
             total += np.where(found, weights[at], 0.0)
             count += found
-        out: np.ndarray = np.where(count > 0, total / np.maximum(count, 1), 1.0)
+        means = np.where(count > 0, total / np.maximum(count, 1), 1.0)
+        out: np.ndarray = means[np.searchsorted(near, lowest)]
         return out
 
 
@@ -150,12 +155,9 @@ def _slopes(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[dict[int, float
 
 
 def _detail(colour: np.ndarray) -> np.ndarray:
-    """Return the fine detail of an image (H, W, 3): the difference of two Gaussian windows."""
-    from scipy.ndimage import gaussian_filter
-
-    fine, coarse = (gaussian_filter(colour, (px, px, 0)) for px in (_FINE_PX, _COARSE_PX))
-    out: np.ndarray = fine - coarse
-    return out
+    """Return the fine detail of an image (H, W, 3) at every `_STRIDE_PX`-th pixel: the difference of two Gaussian
+    windows."""
+    return blur(colour, _FINE_PX, step=_STRIDE_PX) - blur(colour, _COARSE_PX, step=_STRIDE_PX)
 
 
 def _cells(points: np.ndarray) -> np.ndarray:

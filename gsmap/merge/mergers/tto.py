@@ -31,7 +31,7 @@ from gsmap.render.fitter import FitOptions, LearningRates
 from gsmap.types import Gaussians, MergeResult, PosedScene
 from gsmap.types.progress import Progress
 
-VERSION = 10
+VERSION = 11
 """Version, raised whenever the result for the same scenes changes, also through modules of `gsmap.merge` that it
 calls."""
 STEPS: str | None = "steps"
