@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -12,24 +13,18 @@ from gsmap.render.fitter import LearningRates
 _ROWS = 64
 
 
-class Corrections:
-    """Bias corrections by number of updates: (T, 2), for the mean and for the square root of the mean square."""
+def corrections(betas: tuple[float, float], device: torch.device) -> torch.Tensor:
+    """Return the bias corrections by number of updates, (T, 2): for the mean and for the root of the mean square; from
+    the last row on they are 1."""
+    count = max(2, math.ceil(math.log(1e-8) / math.log(max(*betas, 0.5))))
+    t = torch.arange(count, dtype=torch.float64).clamp_min(1)
+    beta1, beta2 = betas
+    return torch.stack([1 / (1 - beta1**t), 1 / (1 - beta2**t).sqrt()], 1).float().to(device)
 
-    def __init__(self, betas: tuple[float, float], device: torch.device) -> None:
-        self.betas, self._device, self._steps = betas, device, 0
-        self._table = self._upto(256)
 
-    def _upto(self, count: int) -> torch.Tensor:
-        t = torch.arange(count, dtype=torch.float64).clamp_min(1)
-        beta1, beta2 = self.betas
-        return torch.stack([1 / (1 - beta1**t), 1 / (1 - beta2**t).sqrt()], 1).float().to(self._device)
-
-    def next(self) -> torch.Tensor:
-        """Return the table for one more step: no Gaussian has more updates than there were steps."""
-        self._steps += 1
-        if self._steps >= len(self._table):
-            self._table = self._upto(2 * len(self._table))
-        return self._table
+def rates_on(rates: LearningRates, device: torch.device) -> torch.Tensor:
+    """Return learning rates as (6,) float32, in the order of their fields."""
+    return torch.tensor([*vars(rates).values()], dtype=torch.float32, device=device)
 
 
 def touched(gradients: Sequence[torch.Tensor]) -> torch.Tensor:
@@ -48,8 +43,9 @@ def step(
     opacities: torch.Tensor,
     frozen: torch.Tensor,
     updates: torch.Tensor,
-    corrections: Corrections,
-    rates: LearningRates,
+    table: torch.Tensor,
+    rates: torch.Tensor,
+    betas: tuple[float, float],
     epsilon: float,
 ) -> None:
     """Step every Gaussian that has a gradient and is not frozen, in place.
@@ -59,10 +55,11 @@ def step(
         gradients: gradients with respect to means, quats, ``scales``, ``opacities`` and sh.
         moments: two lists of moments, each in the order of the values.
         updates: (N,) int32 number of updates of each Gaussian, which is increased.
+        table: `corrections` of the betas.
+        rates: `rates_on` the device of the values.
     """
-    table = corrections.next()
     by = _by_triton if values[0].is_cuda and has_triton() else _by_torch
-    by(values, gradients, moments, scales, opacities, frozen, updates, table, rates, corrections.betas, epsilon)
+    by(values, gradients, moments, scales, opacities, frozen, updates, table, rates, betas, epsilon)
 
 
 def _by_torch(
@@ -74,16 +71,16 @@ def _by_torch(
     frozen: torch.Tensor,
     updates: torch.Tensor,
     table: torch.Tensor,
-    rates: LearningRates,
+    rates: torch.Tensor,
     betas: tuple[float, float],
     epsilon: float,
 ) -> None:
     rows = torch.nonzero(touched(gradients) & ~frozen)[:, 0]
     updates[rows] += 1
-    first, second = table[updates[rows].long()].unbind(1)
-    sh_rate = torch.full((values[4].shape[1], 1), rates.sh_rest, device=values[4].device)
-    sh_rate[0] = rates.sh_base
-    steps = (rates.means, rates.quats, rates.log_scales, rates.logit_opacities, sh_rate)
+    first, second = table[updates[rows].long().clamp_max(len(table) - 1)].unbind(1)
+    sh_rate = rates[5].repeat(values[4].shape[1], 1)
+    sh_rate[0] = rates[4]
+    steps = (*rates[:4], sh_rate)
     chain = (None, None, scales, opacities * (1 - opacities), None)  # chain rule to logarithms and logits
     for value, gradient, m, v, rate, inner in zip(values, gradients, *moments, steps, chain, strict=True):
         g = gradient[rows] if inner is None else gradient[rows] * inner[rows]
@@ -102,7 +99,7 @@ def _by_triton(
     frozen: torch.Tensor,
     updates: torch.Tensor,
     table: torch.Tensor,
-    rates: LearningRates,
+    rates: torch.Tensor,
     betas: tuple[float, float],
     epsilon: float,
 ) -> None:
@@ -116,8 +113,7 @@ def _by_triton(
         *(gradient.contiguous() for gradient in gradients),
         *moments[0],
         *moments[1],
-        *(scales, opacities, frozen.view(torch.uint8), updates, counted, table, n),
-        *(rates.means, rates.quats, rates.log_scales, rates.logit_opacities, rates.sh_base, rates.sh_rest),
+        *(scales, opacities, frozen.view(torch.uint8), updates, counted, table, len(table) - 1, n, rates),
         *(*betas, epsilon),
         SH=columns,
         SH_PADDED=1 << (columns - 1).bit_length(),

@@ -143,8 +143,9 @@ def drawable(values: Sequence[torch.Tensor]) -> torch.Tensor:
 
 def without_zeros(quats: torch.Tensor) -> torch.Tensor:
     """Replace quaternions (N, 4) of length zero by the identity."""
-    identity = quats.new_tensor([1.0, 0, 0, 0])
-    return torch.where(quats.square().sum(1, keepdim=True) > 1e-30, quats, identity)
+    # No constant from the CPU: it could not be copied while CUDA records.
+    real = torch.where(quats.square().sum(1) > 1e-30, quats[:, 0], 1.0)
+    return torch.cat([real[:, None], quats[:, 1:]], 1)
 
 
 class _DeviceCache:
@@ -283,20 +284,32 @@ def _draw(
     return Rendering(colour, alpha[..., 0], depths, ids if dominant_id else None, weights if max_weight else None)
 
 
-def rasterize(
-    scene: DrawableGaussians, views: DeviceViews, depth: bool
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, TileLists]:
-    """Project, sort into tiles and blend Gaussians with gsplat's functions, differentiably.
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """Gaussians projected into C images: (C, N, ...) attributes, or packed (M, ...), a row for each visible Gaussian
+    of each image.
 
-    This is `gsplat.rasterization` without its cost on the CPU: inverted matrices, checks and concatenations. Several
-    views are packed, so that each takes memory only for the Gaussians that it sees.
-
-    Returns:
-        Colour (C, H, W, 3), alpha (C, H, W, 1), expected depth (C, H, W) or None, and the lists of blended Gaussians.
+    Args:
+        radii: int32 pixels, across and down; 0 if a Gaussian is not visible.
+        means2d: pixels.
+        conics: upper triangle of the inverse covariance.
+        colours: at least 0.
+        camera, gaussian: (M,) of packed rows, or None.
     """
+
+    radii: torch.Tensor
+    means2d: torch.Tensor
+    depths: torch.Tensor
+    conics: torch.Tensor
+    opacities: torch.Tensor
+    colours: torch.Tensor
+    camera: torch.Tensor | None = None
+    gaussian: torch.Tensor | None = None
+
+
+def project(scene: DrawableGaussians, views: DeviceViews, packed: bool) -> Projected:
+    """Project Gaussians into views with gsplat's functions, differentiably."""
     gs = load()
-    count, width, height = len(views.T_camera_frame), views.width, views.height
-    packed = count > 1
     projected = gs.fully_fused_projection(
         scene.means,
         None,
@@ -304,8 +317,8 @@ def rasterize(
         scene.scales,
         views.T_camera_frame,
         views.K,
-        width,
-        height,
+        views.width,
+        views.height,
         eps2d=DILATION_PX2,
         near_plane=NEAR_PLANE,
         packed=packed,
@@ -324,26 +337,43 @@ def rasterize(
         coefficients, mask = scene.sh[None], (radii > 0).all(-1)
     colours = gs.spherical_harmonics(math.isqrt(scene.sh.shape[1]) - 1, directions, coefficients, masks=mask)
     colours = torch.clamp_min(colours + 0.5, 0)
-    if depth:
-        colours = torch.cat([colours, depths[..., None]], -1)
+    return Projected(radii, means2d, depths, conics, opacities, colours, camera, gaussian)
+
+
+def rasterize(
+    scene: DrawableGaussians, views: DeviceViews, depth: bool
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, TileLists]:
+    """Project, sort into tiles and blend Gaussians with gsplat's functions, differentiably.
+
+    This is `gsplat.rasterization` without its cost on the CPU: inverted matrices, checks and concatenations. Several
+    views are packed, so that each takes memory only for the Gaussians that it sees.
+
+    Returns:
+        Colour (C, H, W, 3), alpha (C, H, W, 1), expected depth (C, H, W) or None, and the lists of blended Gaussians.
+    """
+    gs = load()
+    count, width, height = len(views.T_camera_frame), views.width, views.height
+    packed = count > 1
+    seen = project(scene, views, packed)
+    colours = torch.cat([seen.colours, seen.depths[..., None]], -1) if depth else seen.colours
     down, across = -(-height // TILE_PX), -(-width // TILE_PX)
     _, crossings, listed = gs.isect_tiles(
-        means2d,
-        radii,
-        depths,
+        seen.means2d,
+        seen.radii,
+        seen.depths,
         TILE_PX,
         across,
         down,
         packed=packed,
         n_images=count,
-        image_ids=camera,
-        gaussian_ids=gaussian,
+        image_ids=seen.camera,
+        gaussian_ids=seen.gaussian,
     )
     starts = gs.isect_offset_encode(crossings, count, across, down)
     image, alpha = gs.rasterize_to_pixels(
-        means2d, conics, colours, opacities, width, height, TILE_PX, starts, listed, packed=packed
+        seen.means2d, seen.conics, colours, seen.opacities, width, height, TILE_PX, starts, listed, packed=packed
     )
-    lists = TileLists(means2d, conics, opacities, gaussian, starts, listed)
+    lists = TileLists(seen.means2d, seen.conics, seen.opacities, seen.gaussian, starts, listed)
     if not depth:
         return image, alpha, None, lists
     return image[..., :3], alpha, image[..., 3] / alpha[..., 0].clamp_min(1e-10), lists

@@ -19,8 +19,9 @@ from gsmap.render.fitter import (
     check_pixels,
     checked_mask,
 )
-from gsmap.render.image_loss import image_loss
+from gsmap.render.image_loss import KnownLoss, image_loss
 from gsmap.render.outputs import image_size
+from gsmap.render.view_step import ViewStep
 from gsmap.types import Cameras, Gaussians
 
 
@@ -41,7 +42,8 @@ class GsplatFitter(Fitter):
         held = checked_mask(frozen, len(gaussians))
         self._background = torch.tensor(self.options.background, dtype=torch.float32, device=self._device)
         self._views: weakref.WeakKeyDictionary[Cameras, gsplat.DeviceViews] = weakref.WeakKeyDictionary()
-        self._corrections = adam.Corrections(self.options.betas, self._device)
+        self._corrections = adam.corrections(self.options.betas, self._device)
+        self._rates, self._sent = adam.rates_on(self.learning_rates, self._device), self.learning_rates
         values = self._moved(gaussians)
         self._set(
             values,
@@ -67,6 +69,7 @@ class GsplatFitter(Fitter):
         hidden = ~gsplat.drawable(values)
         # Gaussians that cannot be drawn do not change; in their place something that no pixel shows is drawn.
         self._hidden = hidden if bool(hidden.any()) else None
+        self._view_steps: dict[tuple[object, ...], ViewStep] = {}
         self.reset_statistics()
 
     def reset_statistics(self) -> None:
@@ -95,32 +98,54 @@ class GsplatFitter(Fitter):
         weights = None if masks is None else self._pixels(masks, (count, height, width), "masks")
         if count == 0:
             return 0.0
+        if self.learning_rates != self._sent:
+            self._rates.copy_(adam.rates_on(self.learning_rates, torch.device("cpu")), non_blocking=True)
+            self._sent = self.learning_rates
+        views = self._seen_from(cameras)
+        if count > 1 or options.statistics:
+            return self._step_packed(views, targets, weights)
+        kind = (width, height, targets.dtype, None if weights is None else weights.dtype)
+        if kind not in self._view_steps:
+            background = self._background if any(options.background) else None
+            loss = (options.ssim_weight, options.huber_delta)
+            self._view_steps[kind] = ViewStep(views, targets, weights, background, *loss)
+        return self._view_steps[kind](self._drawn, self._update, views, targets, weights)
+
+    def _step_packed(
+        self, views: gsplat.DeviceViews, targets: torch.Tensor, weights: torch.Tensor | None
+    ) -> torch.Tensor:
+        """Take a step on several views at once, or with statistics."""
+        options = self.options
         drawn = self._drawn()
-        colour, alpha, _, lists = gsplat.rasterize(drawn, self._seen_from(cameras), depth=False)
+        colour, alpha, _, lists = gsplat.rasterize(drawn, views, depth=False)
         if any(options.background):
             colour = colour + (1 - alpha) * self._background
         if options.statistics:
             lists.means2d.retain_grad()
         losses, gradient = image_loss(colour.detach(), targets, weights, options.ssim_weight, options.huber_delta)
         if len(lists.listed):
-            colour.backward(gradient)
+            KnownLoss.apply(colour, gradient).backward()
             leaves = (drawn.means, drawn.quats, drawn.scales, drawn.opacities, drawn.sh)
             gradients = [leaf.grad for leaf in leaves if leaf.grad is not None]
             if options.statistics:
-                self._count(gradients, lists, width, height)
-            adam.step(
-                self._values,
-                gradients,
-                self._moments,
-                drawn.scales,
-                drawn.opacities,
-                self._frozen,
-                self._updates,
-                self._corrections,
-                self.learning_rates,
-                options.epsilon,
-            )
-        return losses.mean() if count > 1 else losses[0]
+                self._count(gradients, lists, views.width, views.height)
+            self._update(drawn, gradients)
+        return losses.mean()
+
+    def _update(self, drawn: gsplat.DrawableGaussians, gradients: list[torch.Tensor]) -> None:
+        adam.step(
+            self._values,
+            gradients,
+            self._moments,
+            drawn.scales,
+            drawn.opacities,
+            self._frozen,
+            self._updates,
+            self._corrections,
+            self._rates,
+            self.options.betas,
+            self.options.epsilon,
+        )
 
     @torch.no_grad()
     def _drawn(self) -> gsplat.DrawableGaussians:

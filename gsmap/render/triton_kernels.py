@@ -69,7 +69,7 @@ def blend_tile(
     tl.store(shown + (view * height + row) * width + column, dominant, mask=inside)
 
 
-@triton.jit(do_not_specialize=["n"])
+@triton.jit(do_not_specialize=["last", "n"])
 def adam_rows(
     means,
     quats,
@@ -97,13 +97,9 @@ def adam_rows(
     updates,
     counted,
     corrections,
+    last,
     n,
-    rate_means,
-    rate_quats,
-    rate_scales,
-    rate_opacities,
-    rate_base,
-    rate_rest,
+    rates,
     beta1,
     beta2,
     epsilon,
@@ -128,8 +124,15 @@ def adam_rows(
     # Do not count in place: several threads process a row, and one might read a value that another has written.
     count = tl.load(updates + row, mask=row < n, other=0) + touched.to(tl.int32)
     tl.store(counted + row, count, mask=row < n)
-    first = tl.load(corrections + 2 * count, mask=touched, other=1.0)
-    second = tl.load(corrections + 2 * count + 1, mask=touched, other=1.0)
+    corrected = tl.minimum(count, last)
+    first = tl.load(corrections + 2 * corrected, mask=touched, other=1.0)
+    second = tl.load(corrections + 2 * corrected + 1, mask=touched, other=1.0)
+    rate_means = tl.load(rates)
+    rate_quats = tl.load(rates + 1)
+    rate_scales = tl.load(rates + 2)
+    rate_opacities = tl.load(rates + 3)
+    rate_base = tl.load(rates + 4)
+    rate_rest = tl.load(rates + 5)
     alpha = tl.load(opacities + row, mask=touched, other=0.0)
     _adam_part(
         means,

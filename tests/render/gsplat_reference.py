@@ -115,6 +115,7 @@ def _rasterize_to_pixels(
     isect_offsets,
     flatten_ids,
     backgrounds=None,
+    masks=None,
     packed=False,
     absgrad=False,
 ):
@@ -132,6 +133,8 @@ def _rasterize_to_pixels(
             torch.arange(tile_size) + row * tile_size, torch.arange(tile_size) + column * tile_size, indexing="ij"
         )
         ids = flatten_ids[start:end].long()
+        if masks is not None and not masks.reshape(-1)[tile]:
+            ids = ids[:0]
         d = torch.stack([x, y], -1).reshape(-1, 1, 2) + 0.5 - means2d[ids]  # (P, G, 2)
         a, b, c = conics[ids].unbind(1)
         sigma = 0.5 * (a * d[..., 0] ** 2 + c * d[..., 1] ** 2) + b * d[..., 0] * d[..., 1]

@@ -24,6 +24,7 @@ from gsmap.render.backends import gsplat_available
 from gsmap.render.fit import with_enough_memory
 from gsmap.render.gsplat_fit import GsplatFitter
 from gsmap.render.image_loss import image_loss
+from gsmap.render.tile_lists import tile_lists, touched_tiles
 from gsmap.types import Cameras, Gaussians
 
 __all__ = ["gsplat_on_cpu"]
@@ -146,18 +147,61 @@ def test_the_loss_and_its_gradient_are_the_native_ones(device, ssim_weight, delt
         assert np.abs(2 * gradients[i].cpu().numpy() - gradient).max() <= 1e-4 * np.abs(gradient).max()
 
 
+@pytest.mark.parametrize("capacity", [1 << 10, 1 << 12])
+def test_tile_lists_of_fixed_size_hold_what_gsplat_lists(device, capacity):
+    gaussians, cameras = scene(n=250, size=(100, 70))
+    down, across = 5, 7
+    drawn = gsplat.DrawableGaussians.of(GaussianTensors.of(gaussians, device=str(gsplat.device())))
+    seen = gsplat.project(drawn, gsplat.DeviceViews.of(cameras), packed=False)
+    lists = (seen.means2d, seen.radii, seen.depths, 16, across, down)
+    _, crossings, listed = gsplat.load().isect_tiles(*lists, n_images=1)
+    starts = gsplat.load().isect_offset_encode(crossings, 1, across, down)
+    touched = touched_tiles(seen.means2d[0], seen.radii[0], seen.depths[0], down, across)
+    assert 100 < int(touched.upto[-1]) == len(listed) <= capacity
+    found, begins = tile_lists(touched, capacity, down, across)
+    assert torch.equal(found[: len(listed)], listed)
+    assert torch.equal(begins[:down], starts[0])
+    assert begins[down].tolist() == [len(listed), *[capacity] * (across - 1)]
+
+
+@pytest.mark.skipif(not gsplat_available(), reason="needs gsplat and a CUDA GPU")
+def test_recorded_steps_on_cuda_are_the_steps(monkeypatch):
+    gaussians, cameras = scene(4, n=4000, views=6, size=(320, 200))
+    targets = render(gaussians, cameras, backend="native").colour + 0.05
+    after = []
+    for recorded in (True, False):
+        fitter = make_fitter(gaussians, LearningRates(means=1e-3), backend="gsplat")
+        images = [fitter.load(target[None]) for target in targets]
+        for step in range(30):
+            fitter.step(cameras[step % 6], images[step % 6])
+            for recorder in [one._recorder for one in fitter._view_steps.values()]:
+                recorder._possible = recorded
+        graphs = [len(one._recorder._graphs) for one in fitter._view_steps.values()]
+        assert graphs[0] >= 3 if recorded else graphs == [0]
+        after.append(fitter.gaussians())
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
+        ours, theirs, start = (getattr(g, name) for g in (*after, gaussians))
+        assert np.linalg.norm(ours - theirs) < 0.02 * np.linalg.norm(ours - start), name
+
+
 @pytest.mark.parametrize(
-    ("k", "views", "masked", "frozen"),
-    [(1, 1, False, False), (4, 1, True, True), (9, 2, False, True), (16, 1, True, False)],
+    ("k", "views", "masked", "frozen", "statistics"),
+    [
+        (1, 1, False, False, False),
+        (4, 1, True, True, False),
+        (4, 1, False, False, True),
+        (9, 2, False, True, True),
+        (16, 1, True, False, False),
+    ],
 )
-def test_ten_steps_match_the_native_fitter(device, k, views, masked, frozen):
+def test_ten_steps_match_the_native_fitter(device, k, views, masked, frozen, statistics):
     gaussians, cameras = scene(k, n=120, views=views, size=(48, 33))
     rng = np.random.default_rng(1)
     # What is rendered, moved a little: an image of noise has gradients that cancel, and Adam makes their signs count.
     target = np.clip(render(gaussians, cameras, backend="native").colour + 0.1, 0, 1)
     masks = (rng.uniform(size=target.shape[:3]) < 0.7).astype(np.uint8) * 255 if masked else None
     held = np.arange(120) % 3 == 0 if frozen else None
-    options = FitOptions(ssim_weight=0.2, huber_delta=0.05, statistics=True, betas=(0.5, 0.999), epsilon=1e-6)
+    options = FitOptions(ssim_weight=0.2, huber_delta=0.05, statistics=statistics, betas=(0.5, 0.999), epsilon=1e-6)
     rates = LearningRates(means=1e-3)
     native, other = (
         make_fitter(gaussians, rates, frozen=held, options=options, backend=name) for name in ("native", "gsplat")
@@ -175,6 +219,8 @@ def test_ten_steps_match_the_native_fitter(device, k, views, masked, frozen):
         assert np.median(np.abs(ours - theirs)) < 1e-3 * np.abs(ours - start).max(), name
         if held is not None:
             assert np.array_equal(theirs[held], start[held])
+    if not statistics:
+        return
     ours, theirs = native.statistics(), other.statistics()
     assert (ours.seen != theirs.seen).mean() < 0.02
     assert np.allclose(ours.max_weight, theirs.max_weight, atol=0.02)
@@ -248,16 +294,16 @@ def test_a_fit_that_the_gpu_cannot_hold_runs_on_the_cpu(device, monkeypatch, cap
         return backend, [float(fitter.step(cameras, image)) for _ in range(3)]
 
     assert with_enough_memory(fit)[0] == "gsplat"
-    step = gsplat.rasterize
+    project = gsplat.project
     calls = []
 
     def second_fails(*args, **options):
         calls.append(args)
         if len(calls) == 2:
             raise torch.cuda.OutOfMemoryError("no memory")
-        return step(*args, **options)
+        return project(*args, **options)
 
-    monkeypatch.setattr(gsplat, "rasterize", second_fails)
+    monkeypatch.setattr(gsplat, "project", second_fails)
     assert with_enough_memory(fit) == fit("native")
     assert "runs on the CPU" in caplog.text
 

@@ -357,6 +357,15 @@ def steps_per_second(capture: Capture, what: str, times: int, side: int | None, 
             fitter.step(one[i % len(one)], targets[i % len(one)], masks)
         wait()
         row[name] = steps / (time.perf_counter() - start)
+        if backend == "gsplat" and options.profile and torch.cuda.is_available():
+            with torch.profiler.profile() as seen:
+                for i in range(20):
+                    fitter.step(one[i % len(one)], targets[i % len(one)], masks)
+                wait()
+            print(f"-- kernels of 20 steps, {row['row']}")
+            table = seen.key_averages().table(sort_by="self_cuda_time_total", row_limit=28, max_name_column_width=60)
+            for line in table.splitlines():
+                print(line[:62], line[-90:])
     set_num_threads()
     return row | {"gpu_to_cpu": row["gpu"] / row["cpu"], "gpu_to_core": row["gpu"] / row["one_core"]}
 
@@ -416,17 +425,23 @@ def measure_pairs(house: dict[str, Capture], options: argparse.Namespace) -> lis
         captures |= captures_in(kitchen)
     workers = 1 if options.dry_run else os.cpu_count() or 1
     scenes = [(name, c.gaussians, c.cameras) for name, c in captures.items()]
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # of the workers
+        os.environ[name] = "1"
     context = multiprocessing.get_context("spawn")
+    start = time.perf_counter()
     with context.Pool(min(workers, len(scenes))) as pool:
         graphs = pool.starmap(_describe, scenes)
     views = {scene[0]: (*scene, graph, "known") for scene, graph in zip(scenes, graphs, strict=True)}
+    print(f"-- {len(views)} captures described in {time.perf_counter() - start:.1f} s", flush=True)
     pairs = list(itertools.combinations(views, 2))
     many = list(itertools.islice(itertools.cycle(pairs), 2 if options.dry_run else options.pairs))
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "views.pickle").write_bytes(pickle.dumps(views))
         start, accepted = time.perf_counter(), set()
         with context.Pool(workers, _start_worker, (Path(folder) / "views.pickle",)) as pool:
-            for pair, status in pool.imap_unordered(_register, many):
+            for done, (pair, status) in enumerate(pool.imap_unordered(_register, many), start=1):
+                if done in (1, 10, 100):
+                    print(f"-- {done} pairs after {time.perf_counter() - start:.1f} s", flush=True)
                 accepted |= {pair} if status == "accepted" else set()
         seconds = time.perf_counter() - start
     row = {"row": f"{len(many)} candidate pairs among {len(views)} scenes", "seconds": seconds, "workers": workers}
@@ -496,7 +511,8 @@ def profiled(do: Callable, options: argparse.Namespace, what: str):
     seconds = time.perf_counter() - start
     if options.profile:
         print(f"-- profile of {what}, {seconds:.2f} s")
-        pstats.Stats(profile).sort_stats("tottime").print_stats(14)
+        for order in ("tottime", "cumtime"):
+            pstats.Stats(profile).sort_stats(order).print_stats(30 if order == "cumtime" else 14)
     return seconds, answer
 
 
