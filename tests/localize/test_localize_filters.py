@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry import filters
+from gsmap.geometry.rotations import exp_so3
 from gsmap.localize import direct_alignment, resection
 
 
