@@ -270,13 +270,12 @@ def test_derivatives() -> None:
         x = terms.start(scenes, Sim3.identity())
         x = x.moved(rng.normal(size=terms.columns.size) * 1e-2, dim)
         kinds = (*terms.observations(x), *terms.others(x, x))
-        steps = 1e-6 * np.eye(terms.columns.size)
-        for k, kind in enumerate(kinds):
-            J = kind.rows(terms.columns.size)
-            for c, step in enumerate(steps):
-                ahead, behind = x.moved(step, dim), x.moved(-step, dim)
-                numeric = (residuals(terms, ahead, x)[k] - residuals(terms, behind, x)[k]) / 2e-6
-                assert np.abs(numeric - J[:, :, c]).max(initial=0) < 1e-3 * max(1.0, np.abs(J).max(initial=0)), (k, c)
+        for c, step in enumerate(1e-6 * np.eye(terms.columns.size)):
+            ahead, behind = residuals(terms, x.moved(step, dim), x), residuals(terms, x.moved(-step, dim), x)
+            for kind, more, less in zip(kinds, ahead, behind, strict=True):
+                J = kind.rows(terms.columns.size)
+                off = np.abs((more - less) / 2e-6 - J[:, :, c]).max(initial=0)
+                assert off < 1e-3 * max(1.0, np.abs(J).max(initial=0)), (kind.kind, c)
 
 
 def test_a_component_that_is_turned_upright_lies_where_it_lay() -> None:

@@ -5,9 +5,10 @@
 
 Mutants are drawn at random from all modules of the room and planted in a copy of this checkout, one after another.
 First each test of the room (`tests/ROOM`, without slow ones) runs once and its lines in the room are noted. A mutant
-then runs the tests that reach its statement, the quickest first, until one fails or takes far longer than before
-(killed), or those of `--seconds` have passed (survived: a fault that no test of the room detects in that time, or a
-change that makes no difference). Prints the share that is killed, by module, and the survivors.
+then runs the tests that reach its statement, the quickest first, then those that start processes, until one fails or
+takes far longer than before (killed), or those of `--seconds` have passed (survived: a fault that no test of the room
+detects in that time, or a change that makes no difference). Tests that alone take longer than `--seconds` are left
+out, and named. Prints the share that is killed, by module, and the survivors.
 """
 
 from __future__ import annotations
@@ -217,8 +218,9 @@ class _Session:
             changed = _changed_functions(old, new, file)
             if changed is None:  # what a module does when it is imported: every test of it
                 statement = {(file, n) for n in range(old.count("\n") + 1)}
-            reaching = [(took, item) for took, lines, starts, item in tests if starts or lines & statement]
-            reached = any(lines & statement for _, lines, _, _ in tests)
+            reaching = [(took, item) for took, lines, _, item in tests if lines & statement]
+            reached = bool(reaching)
+            reaching += [(took, item) for took, lines, starts, item in tests if starts and not lines & statement]
             chosen, left_s = [], self.most_s
             for took, item in reaching:
                 if took <= left_s:
