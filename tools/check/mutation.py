@@ -5,10 +5,11 @@
 
 Mutants are drawn at random from all modules of the room and planted in a copy of this checkout, one after another.
 First each test of the room (`tests/ROOM`, without slow ones) runs once and its lines in the room are noted. A mutant
-then runs the tests that reach its statement, the quickest first, then those that start processes, until one fails or
-takes far longer than before (killed), or those of `--seconds` have passed (survived: a fault that no test of the room
-detects in that time, or a change that makes no difference). Tests that alone take longer than `--seconds` are left
-out, and named. Prints the share that is killed, by module, and the survivors.
+then runs the tests that reach its statement, the quickest and those that detected most mutants first, then those that
+start processes, until one fails or takes far longer than before (killed), or those of `--seconds` have passed
+(survived: a fault that no test of the room detects in that time, or a change that makes no difference). Tests that
+alone take longer than `--seconds` are left out, and named. Prints the share that is killed, by module, and the
+survivors.
 """
 
 from __future__ import annotations
@@ -41,6 +42,9 @@ _SKIPPED = ("BitOr", "RemoveDecorator")
 """Operators that mostly change annotations (``int | None``), or what dataclasses are by their decorator."""
 
 _LEFT_OUT = shutil.ignore_patterns(".git", "node_modules", ".venv", "__pycache__", ".*_cache", "build", "docs", "dist")
+
+_KILLER = Path("killer")
+"""File of the copy that names the test that has detected a mutant."""
 
 _STARTS_A_PROCESS = {"os.fork", "os.posix_spawn", "subprocess.Popen", "socket.connect"}
 """Audit events of tests that run code in other processes (the last: in those of a fork server)."""
@@ -156,6 +160,7 @@ class _Session:
         self, room: Path, sizes: Counter[Path], mutants: list[tuple[Path, Any]], count: int, most_s: float
     ) -> None:
         self.room, self.sizes, self.mutants, self.count, self.most_s = room, sizes, mutants, count, most_s
+        self.kills: Counter[str] = Counter()
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         if session.testsfailed:
@@ -219,6 +224,7 @@ class _Session:
             if changed is None:  # what a module does when it is imported: every test of it
                 statement = {(file, n) for n in range(old.count("\n") + 1)}
             reaching = [(took, item) for took, lines, _, item in tests if lines & statement]
+            reaching.sort(key=lambda test: test[0] / (1 + self.kills[test[1].nodeid]))
             reached = bool(reaching)
             reaching += [(took, item) for took, lines, starts, item in tests if starts and not lines & statement]
             chosen, left_s = [], self.most_s
@@ -227,6 +233,9 @@ class _Session:
                     chosen.append((took, item))
                     left_s -= took
             survived = not chosen or _in_a_fork(lambda: _run(chosen, changed), 120 + 20 * (self.most_s - left_s))
+        if _KILLER.exists():
+            self.kills[_KILLER.read_text()] += 1
+            _KILLER.unlink()
         was, now = (text.splitlines()[line - 1].strip() for text in (old, new))
         return reached, survived, f"{path}:{line} {mutation.definition_name or ''}: {was}  ->  {now}"
 
@@ -279,6 +288,7 @@ def _run(tests: list[tuple[float, pytest.Item]], changed: dict[CodeType, CodeTyp
         signal.setitimer(signal.ITIMER_PROF, 5 + 10 * took)  # ends this process
         item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
         if item.session.testsfailed:
+            _KILLER.write_text(item.nodeid)
             return 1
     return 0
 
