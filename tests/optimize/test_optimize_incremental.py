@@ -1,10 +1,10 @@
 from dataclasses import replace
 
 import numpy as np
-from made_worlds import PLACING, ROT_RAD, city, true_edges
+from made_worlds import PLACING, ROT_RAD, city, poses_at, true_edges
 
 from gsmap.geometry.rotations import angle_between
-from gsmap.optimize import Params, optimize
+from gsmap.optimize import Params, optimize, surroundings
 
 
 def known(world, count):
@@ -90,3 +90,18 @@ def test_growth_by_a_tenth_and_joined_islands_are_solved_in_full():
     joined = optimize(world.ids[:11], edges, previous=apart, params=growing)
     assert joined.provenance.method == "batch"
     assert len({p.component for p in joined.poses.values()}) == 1
+
+
+def test_surroundings_are_five_edges_wide():
+    """Neighbours, two rings that are solved, and two rings more; the scenes of the last are the rim."""
+    ids = [f"s{k:02d}" for k in range(12)]
+    chain = np.array([[k, k + 1] for k in range(11)])
+    truth = poses_at(3.0 * np.c_[np.arange(12), np.zeros((12, 2))])
+    edges = true_edges(truth, chain, np.random.default_rng(0), ids)
+    before = optimize(ids, edges, params=PLACING)
+    pairs = [(e.target, e.source) for e in edges] + [("new", "s11")]
+    near, rim = surroundings([*ids, "new"], pairs, before, PLACING)
+    assert near == {"new", "s11", "s10", "s09", "s08", "s07"}
+    assert rim == {"s07"}
+    assert surroundings([*ids[:-1], "new"], pairs, before, PLACING) == (set(), set()), "a scene has gone"
+    assert surroundings([*ids, "new"], pairs, before, Params()) == (set(), set()), "few scenes are solved at once"

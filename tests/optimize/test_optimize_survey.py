@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_worlds import poses_at
 from scipy.stats import chi2
 
 from gsmap.geometry.projection import project
+from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize import joint_covariance, optimize
 from gsmap.optimize.survey_terms import SurveyTerms, Unknowns
-from gsmap.types import PoseGraph, Sim3
+from gsmap.types import Edge, PoseGraph, Prior, Sim3
 from gsmap.types.world import ControlPoint, Georeference, ImagePoint, PositionFix, ScaleBar, Survey
 from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site
 
@@ -156,11 +158,10 @@ def test_three_points_tie_a_map_and_say_that_nothing_checks_them() -> None:
 
 
 def test_a_scale_bar_alone_gives_the_metre_and_nothing_else() -> None:
-    site = surveyed_site(6, SMALL)
-    a, b = site.names[0], site.names[3]
+    site = surveyed_site(6, replace(SMALL, rows=1, columns=2, num_control=2, num_check=0))
     ends = np.array([[0.5, -3.0, 0.25], [-2.0, 1.0, 4.0]])  # each in its scene's frame
-    length = float(np.linalg.norm(site.truth[0].apply(ends[0]) - site.truth[3].apply(ends[1])))
-    bar = ScaleBar("bar", (a, b), ends, (1e-3, 1e-3), length, 0.002)
+    length = float(np.linalg.norm(site.truth[0].apply(ends[0]) - site.truth[1].apply(ends[1])))
+    bar = ScaleBar("bar", (site.names[0], site.names[1]), ends, (1e-3, 1e-3), length, 0.002)
     _, tie = solved(site, Survey(bars=(bar,)))
     assert tie.S_world_map is None
     assert tie.metres_per_unit == pytest.approx(0.5, rel=1e-3)
@@ -179,12 +180,16 @@ def test_scale_bars_that_contradict_each_other_are_less_sure_than_they_claim() -
             for k, by in enumerate(off)
         )
         _, tie = solved(site, Survey(bars=bars))
-        assert tie.metres_per_unit == pytest.approx(0.5, rel=5e-2)
+        assert tie.metres_per_unit == pytest.approx(0.5 * (1 + np.median(off)), rel=1e-3)
+        assert [row.error_m[0] / length for row in tie.residuals] == pytest.approx(np.median(off) - off, abs=1e-3)
+        assert [row.sigma_m[0] / length for row in tie.residuals] == pytest.approx([1e-3] * len(off), rel=1e-3)
         return tie.scale_sigma
 
     assert sigma(0.0, 0.0) == pytest.approx(1e-3 / 2**0.5, rel=0.05)
     apart = np.log1p([-0.02, 0.02])  # forty times their sigmas apart
     assert sigma(-0.02, 0.02) == pytest.approx(apart.std(ddof=1) / 2**0.5, rel=0.05)
+    # Of three, the one that the others outvote does not count.
+    assert sigma(0.0, 0.04, 0.0) == pytest.approx(1e-3 / 2**0.5, rel=0.05)
 
 
 def test_a_check_point_is_compared_within_the_sigma_of_the_map() -> None:
@@ -246,6 +251,52 @@ def test_the_covariance_is_honest() -> None:
     # The scale of all scenes is one unknown: 7 dof each.
     assert 0.6 < np.mean(nees) / 7 < 1.5
     assert np.mean(np.array(nees) < chi2.ppf(0.95, 7)) > 0.8
+
+
+def test_common_errors_of_fixes_are_an_offset_a_drift_and_the_sea_level() -> None:
+    """Errors of three photos of a flight and of one of another, by hand; photo 10 is taken after photo 2."""
+    at, ids = np.zeros(3), ("a", "b")
+
+    def fix(scene: str, name: str, sea_m: float = 0.0) -> PositionFix:
+        return PositionFix(name, scene, at, "local", at, (1.0, 1.0), (2.0, 4.0), sea_m)
+
+    terms = SurveyTerms.of(Survey(fixes=(fix("a", "10"), fix("a", "2", 40.0), fix("b", "1"), fix("a", "1"))), ids, 7)
+    x = terms.start(Similarities.stack([Sim3.identity()] * 2), Sim3.identity())
+
+    def off(row: int) -> list[list[float]]:
+        offsets = np.zeros((5, 3))
+        offsets[row] = 1.0  # of its standard deviation
+        return terms.observations(replace(x, offsets=offsets))[2].residuals.tolist()
+
+    none, whole, half = [0.0] * 3, [2.0, 2.0, 4.0], [0.5, 0.5, 1.0]
+    assert off(0) == [whole, whole, none, whole]
+    assert off(1) == [none, none, whole, none]
+    assert off(2) == [half, none, none, [-v for v in half]]  # a drift of half the offset over the flight
+    assert off(3) == [none] * 4, "one photo shows no drift"
+    assert off(4) == [none, [0.0, 0.0, 40.0], none, none]
+
+
+def test_priors_hold_the_map_frame_and_the_survey_holds_the_world() -> None:
+    site = surveyed_site(12, replace(SMALL, rows=2, num_control=5, num_check=0))
+    scene, pose = site.names[2], Sim3(exp_so3([0.3, -0.2, 1.0]), np.array([5.0, -3.0, 2.0]), 0.7)
+    priors = [Prior(scene, pose, np.full(7, 1e-3))]
+    answer = optimize(site.names, site.edges, priors=priors, survey=survey_of(site))
+    assert np.abs(answer.poses[scene].S_map_scene.matrix() - pose.matrix()).max() < 1e-6
+    assert np.linalg.norm(errors(site, answer, answer.world[0]), axis=1).max() < 0.05
+
+
+def test_the_covariance_between_two_scenes_of_a_chain_is_that_of_their_edge() -> None:
+    truth, information = poses_at(np.diag([3.0, 2.0, 1.0])), np.diag([4e4, 2e4, 1e4, 4e2, 2e2, 1e2, 1e10])
+    edges = [Edge(*"ab", (truth[0:1].inverse() @ truth[1:2]).item(0), information)]
+    edges += [Edge(*"bc", (truth[1:2].inverse() @ truth[2:3]).item(0), information / 9)]
+    answer = optimize("abc", edges)
+    joint = joint_covariance(answer, edges, (), None, ["b", "c"], 0)
+    assert not joint[:7].any()
+    S_c_b = answer.poses["c"].S_map_scene.inverse() @ answer.poses["b"].S_map_scene
+    both = np.concatenate([-Similarities.stack([S_c_b]).adjoint()[0], np.eye(7)], axis=1)
+    found = (both @ joint[7:, 7:] @ both.T)[:6, :6]
+    np.testing.assert_allclose(found, np.linalg.inv(information / 9)[:6, :6], atol=1e-6)
+    np.testing.assert_allclose(joint[7:14, 7:14], answer.poses["b"].covariance, atol=1e-9)
 
 
 def residuals(terms: SurveyTerms, x: Unknowns, at: Unknowns) -> list[np.ndarray]:

@@ -10,6 +10,7 @@ import pytest
 from gsmap.errors import CorruptError
 from gsmap.optimize import optimize
 from gsmap.optimize.survey_common_points import CommonPoints
+from gsmap.optimize.survey_shifts import CommonShift, likely_causes
 from gsmap.store.world_ties import world_tie_to_json, world_ties_of_json
 from gsmap.types import Sim3
 from gsmap.types.world import CAUSES, Contradiction, Georeference, Survey, WorldFrame
@@ -171,6 +172,23 @@ def places(own_m: list[float], in_world: np.ndarray) -> CommonPoints:
     )  # fmt: skip
 
 
+def test_a_capture_with_a_larger_common_error_than_stated_is_left_out() -> None:
+    """60 cm, stated as 4 cm: too little to be gross, enough to bend the map by more than its sigma."""
+    m = made(7, side=3)
+    last = m.site.names[8]
+    right, wrong = (
+        m.photos(bench.RTK, captures=range(8)),
+        m.photos(bench.RTK, lambda at: at + np.array([0, 0, 0.6]), [8]),
+    )
+    tie, off = solved(m, right, wrong)
+    assert off < 0.05
+    assert {row.use for row in tie.residuals if row.scene == last} == {"outlier"}
+    assert {row.use for row in tie.residuals if row.scene != last} == {"used"}
+    (one,) = tie.contradictions
+    assert (one.group, one.against, one.kept, one.count, one.scenes) == ("photos", "photos", "against", 8, (last,))
+    assert one.offset_m == pytest.approx((0, 0, 0.6), abs=0.15)
+
+
 def test_poor_places_take_no_information_away() -> None:
     good = np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0], [10, 10, 0.0]])
     rng = np.random.default_rng(0)
@@ -186,6 +204,48 @@ def test_poor_places_take_no_information_away() -> None:
     assert turns[-1] == pytest.approx(0.01 / 10, rel=1e-6)
     line = np.stack([np.linspace(0, 10, 5), np.zeros(5), np.zeros(5)], axis=1)
     assert "is not determined" in str(places([0.01] * 5, line).missing(S))
+
+
+def test_an_error_that_all_points_share_hides_no_blunder() -> None:
+    at = np.random.default_rng(1).uniform(-5, 5, (8, 3))
+    blunder = places([0.01] * 8, at).moved(np.array([3]), np.array([0.0, 0.0, 2.0]))
+    wide, sea = np.full((8, 3), 5.0), np.full(8, 40.0)
+    one = np.zeros(8, dtype=np.int64)
+    _, near = replace(blunder, common_m=wide, sea_m=sea, units=one).robust_fit()
+    assert np.flatnonzero(~near).tolist() == [3]
+    _, near = replace(blunder, common_m=wide, sea_m=sea).robust_fit()
+    assert near.all(), "each has an error of 5 m of its own"
+    _, near = replace(blunder, sea_m=np.where(np.arange(8) == 3, 40.0, 0.0)).robust_fit()
+    assert near.all(), "the others are not measured from the sea"
+
+
+@pytest.mark.parametrize(
+    ("kind", "altitude_m", "shift_m", "ground_m", "causes"),
+    [
+        ("scenes", 520, (30, 0, 0), None, ("horizontal_shift",)),
+        ("scenes", 520, (0, 0, 45), None, ("height_system",)),
+        ("scenes", 520, (3, 0, 45), None, ("height_system", "horizontal_shift")),
+        ("scenes", 520, (60, 0, 45), None, ("horizontal_shift", "height_system")),
+        ("scenes", 520, (0, 0, 300), None, ("vertical_shift",)),
+        ("scenes", 0, (0, 0, -520), None, ("altitude_zero",)),
+        ("scenes", 520 / 0.3048, (0, 0, 520 / 0.3048 - 520), None, ("feet",)),
+        ("photos", 60, (0, 0, -400), 405, ("above_takeoff",)),
+        ("photos", 60, (0, 0, -400), None, ("above_takeoff",)),
+        ("photos", 60, (0, 0, -120), 300, ("above_takeoff",)),  # more than heights above sea and ellipsoid differ
+        ("photos", 60, (0, 0, -100), 300, ("height_system",)),
+        ("photos", 400, (0, 0, -120), 300, ("vertical_shift",)),  # nobody flies 400 m above take-off
+        ("scenes", 60, (0, 0, -400), 405, ("vertical_shift",)),
+    ],
+)
+def test_causes_of_shifts(
+    kind: str, altitude_m: float, shift_m: tuple[float, ...], ground_m: float | None, causes: tuple[str, ...]
+) -> None:
+    at = np.array([[0, 0, -1.0], [10, 0, 0], [0, 10, 1]]) * (altitude_m != 0) + [0, 0, altitude_m - HILL.height_m]
+    some = replace(places([0.1] * 3, at), kinds=np.array([kind] * 3))
+    shift = CommonShift(np.array(shift_m, dtype=float), 0.01 * np.eye(3), -99.0, np.ones(3, dtype=bool))
+    ground = None if ground_m is None else np.array([ground_m, ground_m + 5.0])
+    assert likely_causes(some, shift, HILL, ground) == causes
+    assert likely_causes(some, replace(shift, shaped=False), HILL, ground) == ("shape",)
 
 
 def test_contradictions_are_kept_with_the_tie() -> None:

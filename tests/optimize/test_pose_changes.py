@@ -38,14 +38,17 @@ def test_each_scene_of_both_answers_has_its_change() -> None:
         return PoseGraph({s: ScenePose(s, S, component, "placed") for s, (S, component) in poses.items()}, {})
 
     here = Sim3.identity()
-    before = graph(a=(here, 0), b=(here, 0), c=(here, 0), gone=(here, 1))
-    after = graph(new=(here, 0), a=(here, 0), b=(TURN, 0), c=(here, 1))
+    up, larger = Sim3(np.eye(3), np.array([0.0, 0, 1])), Sim3(np.eye(3), np.zeros(3), 2.0)
+    before = graph(a=(here, 0), b=(here, 0), c=(here, 0), d=(here, 0), e=(here, 0), gone=(here, 1))
+    after = graph(new=(here, 0), a=(here, 0), b=(TURN, 0), c=(here, 1), d=(up, 0), e=(larger, 0))
     found = diff(before, after, {"b": np.array([3.0, 0, 0])})
     assert [(s, change.kind) for s, change in found.items()] == [
         ("new", "added"),
         ("a", "same"),
         ("b", "moved"),
         ("c", "moved"),  # to another component
+        ("d", "moved"),
+        ("e", "moved"),  # by its scale alone
         ("gone", "removed"),
     ]
     assert (found["b"].rotation_deg, found["b"].translation) == pytest.approx((90.0, np.hypot(3, 6)))
