@@ -283,6 +283,10 @@ def test_priors_hold_the_map_frame_and_the_survey_holds_the_world() -> None:
     answer = optimize(site.names, site.edges, priors=priors, survey=survey_of(site))
     assert np.abs(answer.poses[scene].S_map_scene.matrix() - pose.matrix()).max() < 1e-6
     assert np.linalg.norm(errors(site, answer, answer.world[0]), axis=1).max() < 0.05
+    joint = joint_covariance(answer, site.edges, priors, survey_of(site), site.names[5:7], 0)
+    for k, name in enumerate(site.names[5:7], 1):
+        here = slice(7 * k, 7 * k + 7)
+        np.testing.assert_allclose(answer.poses[name].covariance, joint[here, here], rtol=1e-3, atol=1e-9)
 
 
 def test_the_covariance_between_two_scenes_of_a_chain_is_that_of_their_edge() -> None:
