@@ -172,13 +172,13 @@ class EdgeGroup:
 
 
 def _contested(edges: Measurements, accepted: np.ndarray, link: np.ndarray) -> np.ndarray:
-    """Return an (E,) mask of the edges of contested scenes. A scene is contested if at least one in `_CONTESTED_RATIO`
+    """Return an (E,) mask of the edges of contested scenes. A scene is contested if more than one in `_CONTESTED_RATIO`
     of its edges crosses the link; it joins neither side."""
     n = edges.num_scenes
     across = np.bincount(np.r_[edges.targets[link], edges.sources[link]], minlength=n)
     rows = np.union1d(np.flatnonzero(accepted), link)
     whole = np.bincount(np.r_[edges.targets[rows], edges.sources[rows]], minlength=n)
-    contested = (across > 0) & (_CONTESTED_RATIO * across > whole)
+    contested = _CONTESTED_RATIO * across > whole
     out = np.zeros(len(edges), dtype=bool)
     out[rows] = contested[edges.targets[rows]] | contested[edges.sources[rows]]
     return out
