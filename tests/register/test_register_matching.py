@@ -43,7 +43,13 @@ def test_correspondences_of_nothing_and_the_cap():
     rng = np.random.default_rng(2)
     empty = NodeLayer.empty("m", 8)
     assert len(match_nodes(layer(rng, 5, dim=8), empty)) == 0
-    assert len(match_nodes(layer(rng, 50), layer(rng, 50), min_similarity=-1, top_k=5, max_correspondences=20)) == 20
+    a, b = layer(rng, 50), layer(rng, 50)
+    every = match_nodes(a, b, min_similarity=-1, top_k=5)
+    assert len(every) > 100
+    for cap in (20, len(every) - 5):
+        most = match_nodes(a, b, min_similarity=-1, top_k=5, max_correspondences=cap)
+        assert most.target_ids.tolist() == every.target_ids[:cap].tolist()
+        assert most.source_ids.tolist() == every.source_ids[:cap].tolist()
 
 
 @pytest.mark.parametrize("test", ["absolute", "ratio"])
