@@ -8,13 +8,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gsmap.geometry.rotations import exp_so3, skew
+from gsmap.geometry.rotations import exp_so3, retract, skew
 from gsmap.geometry.similarities import Similarities
 from gsmap.geometry.umeyama import umeyama
 from gsmap.register.covariance import (
     Conditioning,
+    PairBlocks,
     PoseUncertainty,
     UnobservedErrors,
+    _measured_hessian,
     in_scene_units,
     load_model,
     uncertainty_of_correspondences,
@@ -22,6 +24,7 @@ from gsmap.register.covariance import (
     unobserved_motion,
 )
 from gsmap.register.degeneracy import point_information
+from gsmap.register.surface import Surface
 from gsmap.types import Sim3
 
 MODEL = replace(load_model(coloured=False), colour_share=0.9, colour_scale_share=2.0)
@@ -191,3 +194,23 @@ def test_unobserved_errors_grow_with_the_field_and_have_limits() -> None:
     wanted = by_colour / np.hypot(2.0, by_colour / m.max_scale_sigma)
     assert unobserved_log_scale(0.0, 2.0, colours, m) == pytest.approx(wanted)
     assert unobserved_log_scale(0.0, 2.0, -colours, m) == pytest.approx(wanted)
+
+
+def test_pairs_of_exact_planes_keep_about_their_curvature_when_they_are_found_again() -> None:
+    """Six walls: nothing but their planes constrains the pose, whichever cells are paired."""
+    rng = np.random.default_rng(6)
+
+    def walls(seed: int) -> Surface:
+        flat = np.random.default_rng(seed).uniform(0.1, 2.9, (6, 4000, 2))
+        points = np.concatenate([np.insert(one, k % 3, 3.0 * (k // 3), axis=1) for k, one in enumerate(flat)])
+        return Surface(points * [1.0, 0.6, 0.8], np.zeros((len(points), 3)), 0.05)
+
+    target, source = walls(1), walls(2)
+    pose = retract(Sim3.identity(), rng.normal(size=7) * 1e-3)
+    blocks = PairBlocks.of(target, source, pose)
+    assert blocks is not None
+    measured = _measured_hessian(target, source, pose, blocks)
+    root = np.linalg.inv(np.linalg.cholesky(blocks.hessian))
+    np.testing.assert_allclose(measured, measured.T, rtol=1e-9, atol=1e-6)
+    constrained = np.linalg.eigvalsh(root @ measured @ root.T)  # beside the curvature with fixed pairs
+    assert 0.65 < constrained[0] < constrained[-1] < 1.15, "rims and corners pair otherwise"
