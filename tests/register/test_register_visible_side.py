@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from register_worlds import texture
 
+from gsmap import _native
 from gsmap.evaluate.registration import pose_error
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
@@ -11,6 +12,7 @@ from gsmap.register import SceneView
 from gsmap.register.covariance import condition
 from gsmap.register.refiners import colored_icp
 from gsmap.register.surface import Surface
+from gsmap.register.visible_side import _fill_unknown
 from gsmap.types import Cameras, Gaussians, SceneGraph, Sim3
 
 THICK = 0.08
@@ -94,6 +96,19 @@ def test_what_no_camera_of_the_capture_saw_faces_nowhere():
     wall = (np.abs(seen.coarse[0][:, 0] - THICK / 2) < 0.02) & (seen.coarse[0][:, 1] < -0.5)
     assert not np.any(seen.oriented_normals[wall])
     assert np.any(seen.oriented_normals)
+
+
+def test_cells_of_unknown_side_take_that_of_their_own_sheet():
+    """Two sheets 6 cm apart, seen from above and from below; of the upper one only every third row was seen."""
+    x, y = (0.05 * one.ravel() for one in np.meshgrid(np.arange(12), np.arange(13)))
+    points = np.concatenate([np.c_[x, y, np.full(156, 0.06)], np.c_[x, y, np.zeros(156)]])
+    normals = np.tile([0, 0, 1.0], (312, 1))
+    normals[::2] *= -1
+    faces = np.repeat([1.0, -1.0], 156)
+    seen = (np.round(y / 0.05).astype(int) % 3 == 0)[np.r_[0:156, 0:156]] | (faces < 0)
+    tree = _native.PointTree(points)
+    found = _fill_unknown(np.where(seen, faces * normals[:, 2], 0.0), points, normals, tree)
+    assert np.array_equal(found * normals[:, 2], faces)
 
 
 def test_a_wall_s_back_is_not_laid_on_its_front():
