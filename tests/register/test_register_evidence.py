@@ -9,9 +9,9 @@ from register_worlds import splat_world
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.register import verdict
-from gsmap.register.evidence import PoseEvidence, measure
+from gsmap.register.evidence import PoseEvidence, _pattern_correlation, measure
 from gsmap.register.surface import Surface
-from gsmap.register.view_cache import ViewCache
+from gsmap.register.view_cache import ViewCache, select_views
 from gsmap.types import Cameras, Gaussians, Proposal, Sim3
 
 _RIGHT = Sim3.identity()
@@ -187,6 +187,28 @@ def test_view_cache_prefers_cameras_that_nothing_hides_the_points_from():
     on_wall = _wall(3.0).means
     assert cache.select_views(on_wall, 1) == [1]
     assert cache.select_views(np.array([[0.0, 0, -5.0]]), 2) == []  # behind both
+
+
+def test_points_are_hidden_where_the_depth_image_is_nearer():
+    """The left half of an image shows something a metre away."""
+    depth = np.full((120, 160), 9.0)
+    depth[:, :80] = 1.0
+    camera = _cameras((0.0, 0, 0))
+    for x in (-1.2, -0.4, 0.4, 1.2):
+        for y in (-0.9, 0.2, 0.9):
+            seen = select_views(camera, np.array([[x, y, 3.0]]), 1, [depth.ravel()])
+            assert seen == ([0] if x > 0 else [])
+
+
+def test_a_pattern_is_compared_where_most_of_a_patch_shows_it():
+    """Of three patches one is whole, one is seen at its rim alone, and one has no pattern in the second scene."""
+    rng = np.random.default_rng(0)
+    a, patch = rng.uniform(size=(64 + 20 + 64, 3)), np.repeat([0, 1, 2], [64, 20, 64])
+    b = 0.5 * a + 0.1
+    b[patch == 2] = 0.4
+    found = _pattern_correlation(a, b, patch)
+    assert found[patch == 0] == pytest.approx(np.ones(64))
+    assert np.isnan(found[patch != 0]).all()
 
 
 _SURE = Proposal("landmarks", Sim3.identity(), with_scale=False, num_inliers=30, log_nfa=-20.0, runner_up=0.2)

@@ -700,3 +700,25 @@ def test_photometric_refiner_reads_each_scene_in_its_own_unit():
         answers.append(photometric.refine(target, source, start).matrix())
     assert not np.allclose(answers[0], start.matrix(), atol=1e-4)
     assert np.allclose(*answers, atol=1e-4)
+
+
+def test_equations_of_corresponding_points_are_the_derivatives_of_their_distances():
+    rng = np.random.default_rng(3)
+    source, pose = rng.uniform(-3, 3, (20, 3)), Sim3(exp_so3([0.4, -0.2, 1.0]), np.array([1.0, 2.0, -1.0]), 1.3)
+    target = pose.apply(source) + rng.normal(0, 0.1, source.shape)
+    here, centre = retract(pose, np.array([0.02, -0.01, 0.03, 0.1, -0.05, 0.07, 0.02])), Sim3(np.eye(3), source.mean(0))
+    points = colored_icp.PointConstraints((target, source))
+    best = umeyama(target, source, with_scale=True)
+    variance = ((best.apply(source) - target) ** 2).mean()
+
+    def cost(step):
+        moved = retract(here @ centre, step) @ centre.inverse()
+        return 0.5 * ((moved.apply(source) - target) ** 2).sum() * 0.01**2 / variance
+
+    information, gradient = points.equations(here, centre.translation, 0.01)
+    steps = 1e-5 * np.eye(7)
+    np.testing.assert_allclose(gradient, [(cost(s) - cost(-s)) / 2e-5 for s in steps], rtol=1e-5)
+    there = points.equations(best, centre.translation, 0.01)
+    np.testing.assert_allclose(there[1], 0, atol=1e-9)  # the closed form is the minimum
+    levers = source - centre.translation
+    np.testing.assert_allclose(information[6, 6], here.scale**2 * (levers**2).sum() * 0.01**2 / variance)
