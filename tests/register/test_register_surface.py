@@ -7,8 +7,8 @@ from scipy.spatial import cKDTree
 from gsmap import _native
 from gsmap.geometry.rotations import exp_so3
 from gsmap.register.covariance import point_to_plane_jacobian
-from gsmap.register.surface import Surface
-from gsmap.types import Sim3
+from gsmap.register.surface import Surface, surface_rows
+from gsmap.types import Gaussians, Sim3
 
 
 @pytest.fixture(scope="module")
@@ -211,3 +211,29 @@ def test_equations_take_nothing_that_does_not_fit(cells):
         ask(partners=np.full((5, 5), float(len(points))))
     with pytest.raises(ValueError, match="lightness each"):
         ask(own=value[1:])
+
+
+@pytest.mark.parametrize(
+    ("opacities", "share"),
+    [
+        (np.linspace(0.4, 1.0, 400), 5 / 6),  # those of at least 0.5
+        (np.linspace(0.0, 0.5, 400), 0.4),  # a faint capture: its most opaque 40 %
+        (np.linspace(0.0, 0.12, 400), 1 / 6),  # but none below 0.1
+    ],
+)
+def test_surface_gaussians_are_opaque_or_the_most_opaque(opacities, share):
+    x, y = np.meshgrid(np.arange(20.0), np.arange(20.0))
+    order = np.random.default_rng(0).permutation(400)
+    with np.errstate(divide="ignore"):
+        logits = np.log(opacities / (1 - opacities))[order]
+    points = 0.03 * np.c_[x.ravel(), y.ravel(), np.zeros(400)]
+    quats, sh = np.tile([1.0, 0, 0, 0], (400, 1)), np.zeros((400, 1, 3))
+    sheet = Gaussians(points, quats, np.full((400, 3), np.log(0.02)), np.clip(logits, -20, 20), sh)
+    rows = surface_rows(sheet, 1.0)
+    assert len(rows) == pytest.approx(400 * share, abs=2)
+    assert opacities[order][rows].min() >= np.delete(opacities[order], rows).max()
+    # The same scene in another unit, and one Gaussian as large as a floater.
+    sizes = np.full((400, 3), np.log(0.08))
+    sizes[rows[0]] = np.log(4.0)
+    other = Gaussians(4.0 * points, quats, sizes, np.clip(logits, -20, 20), sh)
+    assert surface_rows(other, 0.25).tolist() == rows[1:].tolist()
