@@ -8,8 +8,10 @@ below. A constant that all edges of a map share (the noise of its captures) canc
 compared.
 
 The weights come from a conditional logistic regression of wrong against correct poses of the same map, on synthetic
-street facades with varying exposure, distorted and noisy geometry and floaters (``tools/bench/front.py --fit``). The
-number of false alarms is not used: a repeated facade violates the independence that it assumes.
+street facades with varying exposure, distorted and noisy geometry and floaters (``tools/bench/front.py --fit``). A
+repeated facade violates the independence that the number of false alarms assumes, so a pose whose correspondences are
+significant gains nothing from still fewer false alarms. But a pose whose correspondences chance may explain is wrong
+with about that probability.
 """
 
 from __future__ import annotations
@@ -19,13 +21,15 @@ from collections.abc import Mapping
 import numpy as np
 
 COLOUR, DISAGREEMENT, FREE_SPACE, OVERLAP = 1.0, 1.7, 2.4, 1.6
-"""Weights of the features of `features`, in natural log-odds."""
+"""Weights of the features of `features` but the last, whose weight is 1, in natural log-odds."""
+
+_SIGNIFICANT_LOG_NFA = -8.0  # log10 of the number of false alarms from which correspondences are significant
 
 _LEAST, _LEAST_COLOUR = 0.003, 0.02  # smaller shares are noise of rendering
 
 
 def features(evidence: Mapping[str, float], overlap: float) -> np.ndarray:
-    """Compute 4 features that rise with the odds that a pose is wrong; NaN if no camera observed the common surface.
+    """Compute 5 features that rise with the odds that a pose is wrong; NaN if no camera observed the common surface.
 
     Args:
         evidence: evidence of the registration, by name (`gsmap.types.Registration`).
@@ -35,7 +39,9 @@ def features(evidence: Mapping[str, float], overlap: float) -> np.ndarray:
         evidence.get(name, float("nan")) for name in ("colour_correlation", "disagreement", "free_space_violation")
     )
     logs = np.log([1 - colour + _LEAST_COLOUR, disagreement + _LEAST, free_space + _LEAST])
-    return np.r_[logs, overlap]
+    log_nfa = evidence.get("log_nfa", float("nan"))
+    known = _SIGNIFICANT_LOG_NFA if np.isnan(log_nfa) else np.clip(log_nfa, _SIGNIFICANT_LOG_NFA, 0.0)
+    return np.r_[logs, overlap, known * np.log(10)]
 
 
 def log_odds_wrong(evidence: Mapping[str, float], overlap: float) -> float:
@@ -45,4 +51,4 @@ def log_odds_wrong(evidence: Mapping[str, float], overlap: float) -> float:
     Args:
         evidence, overlap: as in `features`.
     """
-    return float(features(evidence, overlap) @ [COLOUR, DISAGREEMENT, FREE_SPACE, OVERLAP])
+    return float(features(evidence, overlap) @ [COLOUR, DISAGREEMENT, FREE_SPACE, OVERLAP, 1.0])

@@ -51,6 +51,9 @@ def test_a_front_laid_along_itself_is_the_less_likely_though_less_of_it_disagree
     assert log_odds_wrong(ALONG, 0.9) > log_odds_wrong(ALONG, 0.4)  # of much overlap more is asked
     for name, worse in (("colour_correlation", 0.3), ("disagreement", 0.05), ("free_space_violation", 0.05)):
         assert log_odds_wrong({**ALONG, name: worse}, 0.9) > log_odds_wrong(ALONG, 0.9)
+    chance, significant, sure = (log_odds_wrong({**ALONG, "log_nfa": n}, 0.9) for n in (-2.0, -8.0, -90.0))
+    assert chance - significant == pytest.approx(6 * np.log(10))
+    assert significant == sure == log_odds_wrong(ALONG, 0.9)
     assert np.isnan(log_odds_wrong({"colour_correlation": 0.8}, 0.5))  # a scene without cameras
     assert np.isnan(log_odds_wrong({}, 0.0))  # a person's own measurement
 

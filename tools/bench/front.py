@@ -94,12 +94,12 @@ def read(folder: Path, seed: int) -> Front:
     ids = [scenes[name].id for name in sorted(scenes)]
     truth = {scenes[name].id: Sim3.from_matrix(np.array(T)).inverse() for name, T in stored["truth"].items()}
     middles = {scene.id: scene.bounds.mean(0) for scene in scenes.values()}
-    front = Front(ids, truth, middles, edges, np.zeros((0, 5)))
+    front = Front(ids, truth, middles, edges, np.zeros((0, 6)))
     rows = []
     for target, source, S, evidence, overlap in stored["judged"]:
         error_m = front.error_m(target, source, Sim3.from_matrix(np.array(S)))
         rows.append(np.r_[error_m < RIGHT_M, edge_likelihood.features(evidence, overlap)])
-    return replace(front, judged=np.array(rows).reshape(-1, 5))
+    return replace(front, judged=np.array(rows).reshape(-1, 6))
 
 
 def make(folder: Path, seed: int) -> None:
@@ -122,6 +122,7 @@ def make(folder: Path, seed: int) -> None:
                 name: float(getattr(one.evidence, name))
                 for name in ("colour_correlation", "disagreement", "free_space_violation")
             }
+            figures["log_nfa"] = one.proposal.log_nfa
             if one.evidence.num_seen:
                 S = one.proposal.S_target_source.matrix().tolist()
                 judged.append([target.id, source.id, S, figures, one.evidence.overlap])
@@ -199,23 +200,27 @@ def fit(judged: list[np.ndarray]) -> None:
 
 
 def weights_now() -> list[float]:
-    return [edge_likelihood.COLOUR, edge_likelihood.DISAGREEMENT, edge_likelihood.FREE_SPACE, edge_likelihood.OVERLAP]
+    e = edge_likelihood
+    return [e.COLOUR, e.DISAGREEMENT, e.FREE_SPACE, e.OVERLAP, 1.0]
 
 
 def differences(judged: np.ndarray) -> np.ndarray:
-    """(P, 4) figures of each wrong pose less those of each right one."""
+    """(P, 5) figures of each wrong pose less those of each right one."""
     right, wrong = judged[judged[:, 0] > 0, 1:], judged[judged[:, 0] == 0, 1:]
-    return np.asarray((wrong[:, None] - right[None]).reshape(-1, 4))
+    return np.asarray((wrong[:, None] - right[None]).reshape(-1, 5))
 
 
 def weights(judged: list[np.ndarray], shrink: float = 0.05) -> np.ndarray:
-    """(4,) weights, none below 0, fitted on pairs of a wrong and a right pose of one front."""
+    """(5,) weights, none below 0, fitted on pairs of a wrong and a right pose of one front; the last, of false alarms,
+    is 1."""
     parts = [differences(rows) for rows in judged]
     count = [min(int(rows[:, 0].sum()), int((rows[:, 0] == 0).sum())) for rows in judged]
     share = np.concatenate([np.full(len(part), n / max(len(part), 1)) for part, n in zip(parts, count, strict=True)])
     x = np.concatenate(parts)
     found = minimize(
-        lambda w: share @ np.logaddexp(0, -x @ w) + shrink * w @ w, np.full(4, 0.5), bounds=[(0, None)] * 4
+        lambda w: share @ np.logaddexp(0, -x @ w) + shrink * w @ w,
+        np.r_[np.full(4, 0.5), 1.0],
+        bounds=[*[(0, None)] * 4, (1, 1)],
     )
     return np.asarray(found.x)
 
