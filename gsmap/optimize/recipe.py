@@ -9,12 +9,12 @@ from gsmap.optimize.params import Params
 from gsmap.types.plain import plain
 
 VERSIONS = {
-    "optimize": 4,
-    "optimize.incremental": 4,
+    "optimize": 5,
+    "optimize.incremental": 5,
     "perceptual_aliasing": 1,
     "gravity_align": 1,
     "keep_unchanged_poses": 1,
-    "survey": 2,
+    "survey": 3,
 }
 """Version of each part of the optimization, raised whenever the part's result changes for the same input. The versions
 are here because the modules of the parts load solvers."""

@@ -14,16 +14,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.gtsam_solve import anchor_directions
 from gsmap.optimize.measurements import all_rigid, measurements
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.survey_groups import SurveyFailure, solve_groups
-from gsmap.optimize.survey_report import active_observations, build_world_tie, tie_by_bars
+from gsmap.optimize.survey_report import (
+    Solution,
+    active_observations,
+    build_world_tie,
+    tie_by_bars,
+    variance_factor,
+)
 from gsmap.optimize.survey_system import Component, System
 from gsmap.optimize.survey_terms import SurveyTerms
 from gsmap.types import Edge, PoseGraph, Prior, Sim3
 from gsmap.types.world import UNSOLVED, Georeference, Survey
+
+_MAX_WIDENINGS = 4
+_RARE = 0.05  # probability that a control point is a blunder, and that all are less precise than stated
+_MAGNITUDES = 200.0  # range of the sizes of blunders, and of the standard deviations
+_SURE = 7.0  # blunders must be so many times likelier to be left out
+_LOW = 0.05  # probability that the points scatter even more than is assumed
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +83,64 @@ def tie_component(
 def _surveyed(
     system: System, whole: Component, poses: Similarities, survey: Survey, index: int, marginal_scenes: int
 ) -> ComponentSolution:
-    found = solve_groups(system, survey.frame)
+    system, found, widened = _with_honest_points(system, survey)
     if isinstance(found, SurveyFailure):
         return ComponentSolution(poses, None, tie_by_bars(system, index, survey, found))
     x, factor = found.x, found.factor
     tie = build_world_tie(system, found, index, survey.frame)
+    if widened:
+        tie = replace(tie, notes=(widened, *tie.notes))
     covariances = factor.scene_covariances() if len(whole.scenes) <= marginal_scenes else None
     return ComponentSolution(poses.replaced(whole.scenes, x.scenes), covariances, tie)
+
+
+def _with_honest_points(system: System, survey: Survey) -> tuple[System, Solution | SurveyFailure, str]:
+    """Solve; where control points are left out that larger standard deviations of all explain about as well as
+    blunders, solve again with these, because those that were left out may be right and the others wrong.
+
+    Returns:
+        The system with the standard deviations that were used, its solution, and a note if they were enlarged.
+    """
+    found, times, note = solve_groups(system, survey.frame), 1.0, ""
+    for _ in range(_MAX_WIDENINGS):
+        if isinstance(found, SurveyFailure) or (scatter := _scatter(system, found)) == 1:
+            break
+        times *= scatter
+        note = (
+            f"control points scatter beyond their stated standard deviations, so these were taken to be {times:.2g} "
+            f"times as large (--sigma states them)"
+        )
+        sigmas = {p.name: (times * p.sigma_m[0], times * p.sigma_m[1]) for p in survey.points}
+        wider = replace(survey, points=tuple(replace(p, sigma_m=sigmas[p.name]) for p in survey.points))
+        system = System(system.own, SurveyTerms.of(wider, system.terms.scene_ids, system.own.dim), system.scenes)
+        found = solve_groups(system, survey.frame)
+    if note and isinstance(found, SurveyFailure):
+        found = replace(found, problem=f"{note}; {found.problem}")
+    return system, found, note
+
+
+def _scatter(system: System, found: Solution) -> float:
+    """Return by how many times control points may scatter beyond their stated standard deviations, if that explains the
+    points that are left out about as well as blunders do; else 1. It is an upper bound, since few points show it.
+
+    Both hypotheses are compared by their likelihood. Blunders are rare, and of any order of magnitude; so are
+    understated standard deviations, which are the same for all points.
+    """
+    tests = system.tests(found.x, found.active, found.factor)
+    out = system.usable[0] & ~found.active[0] & (tests.dofs[0] == 3) & np.isfinite(tests.statistics[0])
+    if not out.any() or not found.active[0].any():
+        return 1.0
+    used = system.terms.observations(found.x)[0].squares[found.active[0]].sum()
+    squares = tests.statistics[0][out]
+    total, dof = float(used + squares.sum()), float(tests.redundancies[0].sum() + 3 * out.sum())
+    # Whitened residuals r of a blunder have the density 1 / (4 pi |r|^3 log(range)), times that of a normal at 0.
+    blunder = 4 * np.pi * np.log(_MAGNITUDES) / (2 * np.pi) ** 1.5
+    blunders = -used / 2 + (np.log(_RARE) - np.log(blunder * squares**1.5)).sum()
+    variance = total / dof
+    scattered = -dof / 2 * np.log(variance) - dof / 2 + np.log(_RARE * np.sqrt(np.pi / dof) / np.log(_MAGNITUDES))
+    if variance <= 1 or blunders - scattered >= np.log(_SURE):
+        return 1.0
+    return float(np.sqrt(total / chi2_quantile(_LOW, int(dof))))
 
 
 def _is_finite(surveyed: ComponentSolution) -> bool:
@@ -126,4 +190,6 @@ def joint_of_answer(
     active = active_observations(system, tie)
     weights = system.as_weights(active)
     x = system.fit(replace(x, points=system.points_at(x, active)), weights, hold=True)
-    return system.factor(x, weights).joint(wanted)
+    factor = system.factor(x, weights)
+    # As in the tie: what scatters beyond its stated errors makes the whole solution less certain.
+    return factor.joint(wanted) * variance_factor(system, x, active, system.tests(x, active, factor))

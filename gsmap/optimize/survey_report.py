@@ -74,7 +74,7 @@ def build_world_tie(system: System, solved: Solution, index: int, frame: WorldFr
     rows = _point_rows(system, solved, tests)
     rows += _image_rows(system, x, active, tests) + _fix_rows(system, solved, tests) + _bar_rows(system, solved, tests)
     covariance = world_covariance(system, factor)
-    factor_of = _variance_factor(system, x, active, tests)
+    factor_of = variance_factor(system, x, active, tests)
     notes = []
     if factor_of > 1:
         notes.append(
@@ -143,19 +143,21 @@ def world_covariance(system: System, factor: Factor) -> np.ndarray:
     return out
 
 
-def _variance_factor(system: System, x: Unknowns, active: Active, tests: ObservationTests) -> float:
-    """Compute the variance factor of the residuals if chance does not explain them; at least 1."""
+def variance_factor(system: System, x: Unknowns, active: Active, tests: ObservationTests) -> float:
+    """Compute the variance factor of the used observations if chance does not explain their residuals; at least 1.
+
+    It is the largest of all observations together and of each kind alone (points, images, fixes and bars), whose
+    degrees of freedom are its redundancies (Foerstner 1979): many images that agree hide no points that do not.
+    """
     terms = system.terms.observations(x)
-    total = sum(float(t.squares[a].sum()) for t, a in zip(terms, active, strict=True))
-    count = sum(int(t.residuals.shape[1] * a.sum()) for t, a in zip(terms, active, strict=True))
-    count -= int(
-        sum(3 - (2 if i.depth is None else 3) for i, a in zip(system.terms.images, active[1], strict=True) if a)
-    )
-    unknown = 7 + 3 * len({int(k) for k in system.terms.image_points[active[1]]})
-    free = count - unknown
-    if free <= 0 or total <= chi2_quantile(GATE_PROBABILITY, free):
-        return 1.0
-    return total / free
+    squares = [float(t.squares[a].sum()) for t, a in zip(terms, active, strict=True)]
+    free = [float(one.sum()) for one in tests.redundancies]
+    found = [1.0]
+    for some in ((0,), (1,), (2,), (3,), (0, 1, 2, 3)):
+        total, dof = sum(squares[kind] for kind in some), sum(free[kind] for kind in some)
+        if dof >= 1 and total > chi2_quantile(GATE_PROBABILITY, int(np.ceil(dof))):
+            found.append(total / dof)
+    return max(found)
 
 
 def _point_rows(system: System, solved: Solution, tests: ObservationTests) -> list[Residual]:

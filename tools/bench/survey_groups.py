@@ -191,6 +191,14 @@ def _corners(m: Made, sigmas: Sigmas, change: Callable[[np.ndarray], np.ndarray]
     return m.photos(sigmas, captures=corners[:3]), m.photos(sigmas, change, captures=corners[3:])
 
 
+def _scattered(m: Made, times: float) -> Survey:
+    """Control points with errors of so many times the standard deviation that they state."""
+    whole = m.points()
+    errors = m.rng.normal(size=(len(whole.points), 3)) * 0.01 * times
+    points = [replace(one, position=one.position + off) for one, off in zip(whole.points, errors, strict=True)]
+    return replace(whole, points=tuple(points))
+
+
 def _half_points(m: Made) -> tuple[Survey, Survey]:
     whole, moved = m.points(), m.points(m.geoid())
     half = len(whole.points) // 2
@@ -246,6 +254,12 @@ MIXTURES = {
     "points, one wrong + phones": Mixture(lambda m: (_blundered(m), m.photos(PHONE))),
     "points, one wrong + phones above take-off": Mixture(
         lambda m: (_blundered(m), m.photos(PHONE, m.takeoff)), "above_takeoff"
+    ),
+    "points of 5 times the stated error + phones": Mixture(
+        lambda m: (_scattered(m, 5), m.photos(PHONE)), near=False, tied=None
+    ),
+    "points of 30 times the stated error + phones": Mixture(
+        lambda m: (_scattered(m, 30), m.photos(PHONE)), near=False, tied=None
     ),
     "three points + phones": Mixture(lambda m: (m.points(keep=3), m.photos(PHONE))),
     "three points + RTK in feet": Mixture(lambda m: (m.points(keep=3), m.photos(RTK, m.feet)), "feet"),
