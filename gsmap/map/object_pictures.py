@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,8 +12,9 @@ from gsmap.geometry.metric_scale import in_metres
 from gsmap.map.comparison_pictures import posed_scene
 from gsmap.map.objects import MapObjects
 from gsmap.store import Store
-from gsmap.types import ObjectObservation, PosedScene
+from gsmap.types import ObjectObservation
 from gsmap.view.change_picture import draw_place
+from gsmap.view.object_picture import SegmentedViews
 
 
 class ObjectPictures:
@@ -22,10 +24,11 @@ class ObjectPictures:
         self._store, self._known = store, known
         self._lock = threading.Lock()
         self._counts: dict[str, np.ndarray] = {}  # samples of each segment of a scene
-        self._posed: tuple[str, PosedScene] | None = None
+        self._shown: dict[str, Sequence[np.ndarray]] = {}
+        self._read: tuple[str, SegmentedViews] | None = None
 
     def draw(self, ref: str, side_px: int = 400) -> np.ndarray:
-        """Render an object by its id or name with its box, (H, W, 3) uint8.
+        """Render an object by its id or name outlined in its surroundings, (H, W, 3) uint8.
 
         Raises:
             NotFoundError: no such object, or no placed scene shows it.
@@ -45,10 +48,18 @@ class ObjectPictures:
             best = max(shown, key=self._num_samples)
             assert best.box is not None
             metres = self._known.metres[thing.component]
-            if self._posed is None or self._posed[0] != best.scene:
+            if self._read is None or self._read[0] != best.scene:
                 S = in_metres(graph.poses[best.scene].S_map_scene, metres)
-                self._posed = best.scene, posed_scene(self._store, best.scene, S)
-            return draw_place(self._posed[1], best.box * metres, side_px)
+                posed, stored = posed_scene(self._store, best.scene, S), self._store.graphs.load(best.scene)
+                segments = None if stored is None else stored.segments
+                members = np.full(len(posed.gaussians), -1) if segments is None else segments.members
+                self._read = best.scene, SegmentedViews(posed, members, self._shown.get(best.scene))
+            views = self._read[1]
+            drawn = None
+            if best.thing >= 0 and views.scene.cameras is not None:
+                drawn = views.draw(best.thing, side_px)
+                self._shown[best.scene] = views.shown
+            return draw_place(views.scene, best.box * metres, side_px) if drawn is None else drawn
 
     def _num_samples(self, sighting: ObjectObservation) -> int:
         """Return the number of samples of a scene's own segment of an object; 0 without one."""

@@ -22,6 +22,7 @@ _HANGING = 0.75  # of the height of a room: segments above it hang from the ceil
 _TALL_M, _DEEP_M = 1.7, 0.3  # taller segments that are less deep are doors and remains of walls
 _FLAT_M = 0.15  # segments that are less thick are flat: pictures, mirrors, doors, patches of walls
 _OFF_FLOOR_M = 0.3  # flat segments that begin lower are doors, skirting boards and bits of the floor
+_FLAT_AT_CEILING_M = 0.22  # flat segments that reach so near to the ceiling are windows and patches of walls
 _MAX_FLAT_M = 2.0  # larger flat segments are patches of walls
 _MAX_ASPECT = 3.0  # narrower flat segments are trims and curtain edges
 _MIN_PATTERN = 25.0  # range of lightness of a flat segment that is no patch of a wall (CIE L*a*b*),
@@ -45,7 +46,8 @@ def is_building_part(points: np.ndarray, lab: np.ndarray, floor_m: float, ceilin
         return True
     bottom, room = bounds[0, 2] - floor_m, ceiling_m - floor_m
     hangs = room >= _ROOM_M and bottom > _HANGING * room
-    if room >= _ROOM_M and not hangs and ceiling_m - bounds[1, 2] < _AT_CEILING_M:
+    at_ceiling_m = _FLAT_AT_CEILING_M if thickness < _FLAT_M else _AT_CEILING_M
+    if room >= _ROOM_M and not hangs and ceiling_m - bounds[1, 2] < at_ceiling_m:
         return True
     if height > _TALL_M and thickness < _DEEP_M:
         return True

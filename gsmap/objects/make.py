@@ -26,7 +26,7 @@ from gsmap.types import MapObject, ObjectObservation, ObservationState
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
-VERSION = 3
+VERSION = 4
 """Version, raised whenever the objects of the same scenes change, also through other modules of `gsmap.objects`."""
 
 _FLOOR_AND_CEILING = (0.01, 0.995)  # quantiles of the heights of a scene's segments

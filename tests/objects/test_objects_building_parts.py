@@ -59,6 +59,7 @@ def test_a_picture_is_an_object_and_a_patch_of_the_wall_is_not():
     assert not is_part(picture, WOOD, WALL)
     assert is_part(picture, WALL)
     assert is_part(sheet((0, 0, 0.1), (0.9, 0, 0), (0, 0, 2.0)), WOOD, WALL), "a door"
+    assert is_part(sheet((0, 0, 1.5), (0.8, 0, 0), (0, 0, 0.85)), WOOD, WALL), "a patch below the ceiling"
     assert is_part(sheet((0, 0, 0), (1.5, 0, 0), (0, 1.0, 0)), WOOD, WALL), "a rug"
 
 
