@@ -43,6 +43,7 @@ CSP = {
 """Content-Security-Policy of the page. Spark needs WebAssembly from its script, and workers from blobs."""
 
 _MERGED_SUFFIXES = (".json", ".glb")
+_OBJECT_PICTURES = 300  # largest number of objects with pictures
 _HEAD = re.compile(r"<head[^>]*>", re.IGNORECASE)
 _SCRIPT = re.compile(r'<script type="module"[^>]*\bsrc="(?:\./)?([^"]+)"[^>]*>\s*</script>')
 _STYLE = re.compile(r'<link rel="stylesheet"[^>]*\bhref="(?:\./)?([^"]+)"[^>]*/?>')
@@ -96,7 +97,7 @@ class _Maker:
         Args:
             view: Content of the map.
             size: Number of Gaussians per scene in an overview; default: by the size of the component.
-            pictures: Include pictures of pairs and changes.
+            pictures: Include pictures of pairs, changes and objects.
         """
         overviews: dict[int, ViewOverview] = {}
         boxes: dict[str, np.ndarray] = {}
@@ -129,8 +130,17 @@ class _Maker:
         if view.has_objects:
             graph = self.tried("the graph of objects", self.page_source.graph)
             if graph is not None:
-                has_objects = True
-                yield "graph.json", _json({**graph, "objects": [{**one, "picture": None} for one in graph["objects"]]})
+                has_objects, objects = True, []
+                for place, one in enumerate(graph["objects"]):
+                    picture = None
+                    if pictures and place < _OBJECT_PICTURES:
+                        picture = self.tried(
+                            f"object {one['id']}", lambda o=one: self.page_source.object_picture(o["id"])
+                        )  # type: ignore[misc]
+                    if picture is not None:
+                        yield f"objects/{one['id']}.jpg", jpeg(picture)
+                    objects.append({**one, "picture": None if picture is None else f"objects/{one['id']}.jpg"})
+                yield "graph.json", _json({**graph, "objects": objects})
         served = ServerState(False, boxes, overviews, live=False, drawn=frozenset(drawn))
         said = summary(view, served)
         yield "map.json", _json(said | {"graph": "graph.json" if has_objects else None})

@@ -17,7 +17,7 @@ from headless import Page
 from raising import raises
 from view_room import A, B, C, MadeDoors, blob, page_folder
 
-from gsmap.errors import GsmapError, InputError
+from gsmap.errors import GsmapError, InputError, NotFoundError
 from gsmap.formats import spz
 from gsmap.view import Params, ViewChange
 from gsmap.view.built import built_page
@@ -107,6 +107,22 @@ def test_pictures_of_a_static_page_are_bounded(page_source, levels, tmp_path):
     assert page_source.drawn == 0
     assert json.loads((out / f"edges/{A}-{B}.json").read_bytes())["views"] == []
     assert json.loads((out / "map.json").read_bytes())["changes"][0]["pictures"] is None
+
+
+def test_objects_have_pictures_where_a_scene_shows_them(page_source, levels, tmp_path):
+    def draw(name):
+        if name == "o2":
+            raise NotFoundError("no scene shows o2")
+        return np.zeros((4, 6, 3), np.uint8)
+
+    objects = [{"id": name, "picture": f"objects/{name}.jpg"} for name in ("o1", "o2")]
+    page_source.graph = lambda: {"objects": objects, "relations": [], "rooms": []}
+    page_source.object_picture = draw
+    out = site(page_source, levels, tmp_path)
+    said = json.loads((out / "graph.json").read_bytes())["objects"]
+    assert [one["picture"] for one in said] == ["objects/o1.jpg", None]
+    assert [path.name for path in (out / "objects").iterdir()] == ["o1.jpg"]
+    assert (out / "objects" / "o1.jpg").read_bytes()[:2] == b"\xff\xd8"
 
 
 def test_a_scene_that_cannot_be_read_is_left_out_and_named(page_source, levels, tmp_path):

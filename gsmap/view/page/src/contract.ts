@@ -189,7 +189,7 @@ export interface ObjectEntry {
   present: boolean;
   num_sightings: number;
   room: string | null; // id of the one it stands in
-  picture: string | null; // GET: a small picture of it; null in a static page
+  picture: string | null; // GET: a small picture of it
 }
 export interface RoomEntry {
   id: string; // "r1"
