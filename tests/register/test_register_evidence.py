@@ -9,7 +9,14 @@ from register_worlds import splat_world
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.register import verdict
-from gsmap.register.evidence import PoseEvidence, _pattern_correlation, measure
+from gsmap.register.evidence import (
+    CrossViewStats,
+    PoseEvidence,
+    _depth_range,
+    _opponent_colours,
+    _pattern_correlation,
+    measure,
+)
 from gsmap.register.surface import Surface
 from gsmap.register.view_cache import ViewCache, select_views
 from gsmap.types import Cameras, Gaussians, Proposal, Sim3
@@ -209,6 +216,37 @@ def test_a_pattern_is_compared_where_most_of_a_patch_shows_it():
     found = _pattern_correlation(a, b, patch)
     assert found[patch == 0] == pytest.approx(np.ones(64))
     assert np.isnan(found[patch != 0]).all()
+
+
+def test_a_pattern_differs_only_far_below_what_is_usual_in_the_pair():
+    """21 Gaussians of a square decimetre each, with the correlation of the pattern on each."""
+
+    def other_m2(correlations):
+        stats = CrossViewStats.of(21)
+        stats.agrees[:] = True
+        stats.add_pixels(np.arange(21), np.full(21, 0.01), np.array(correlations))
+        through, other, observed = stats.areas_m2()
+        assert (through, observed) == pytest.approx((0.0, 0.21))
+        return other
+
+    assert other_m2([0.9] * 18 + [0.0, 0.05, 0.15]) == pytest.approx(0.02)
+    assert other_m2(np.linspace(-0.6, 0.8, 21)) == 0.0, "a noisy capture"
+    assert other_m2([np.nan] * 21) == 0.0
+
+
+def test_opponent_colours_of_greys_are_their_lightness():
+    greys = np.repeat([[0.3], [2.0], [-1.0]], 3, axis=1)
+    np.testing.assert_allclose(_opponent_colours(greys), [[0.3, 0, 0], [1, 0, 0], [0, 0, 0]], atol=1e-12)
+
+
+def test_depths_range_over_all_neighbours():
+    depth = np.random.default_rng(0).uniform(1, 5, (6, 7))
+    solid = np.random.default_rng(1).uniform(size=depth.shape) < 0.7
+    low, high = _depth_range(depth, solid)
+    for i, j in np.ndindex(6, 7):
+        here = slice(max(i - 1, 0), i + 2), slice(max(j - 1, 0), j + 2)
+        near = depth[here][solid[here]]
+        assert (low[i, j], high[i, j]) == (near.min(initial=np.inf), near.max(initial=-np.inf))
 
 
 _SURE = Proposal("landmarks", Sim3.identity(), with_scale=False, num_inliers=30, log_nfa=-20.0, runner_up=0.2)

@@ -504,14 +504,15 @@ def test_a_rigid_pose_knows_what_its_scale_could_move(world, surfaces):
     assert off @ np.linalg.solve(alone, off) == pytest.approx(1.0, rel=0.05)
 
 
-@pytest.mark.parametrize("factor", [0.96, 1.04])
-def test_a_scale_some_percent_off_is_reached_from_a_pose_that_it_put_off(factor):
+@pytest.mark.parametrize(("factor", "voted"), [(0.96, 1.0), (1.04, 1.02)])
+def test_a_scale_some_percent_off_is_reached_from_a_pose_that_it_put_off(factor, voted):
     world = splat_world(3, scale=factor)
     S, centre = world.S_target_source, np.median(world.source.gaussians.means, axis=0)
-    start = Sim3(S.rotation, S.apply(centre) - S.rotation @ centre + [0.0, 0.15, 0.15])
+    start = Sim3(S.rotation, S.apply(centre) - voted * S.rotation @ centre + [0.0, 0.15, 0.15], voted)
     pair = MetricPair.of(world.target, world.source, Proposal("test", start, False, 50), Params())
-    pose, known, decision = refine_and_select_scale(pair, start, Params(), with_scale=False)
-    assert abs(pose.scale / factor - 1) < 0.002
+    pose, known, decision = refine_and_select_scale(pair, pair.to_metres(start), Params(), with_scale=False)
+    assert abs(pair.to_scene_units(pose).scale / factor - 1) < 0.002
+    assert decision.log_scale == pytest.approx(np.log(factor), abs=0.002)
     assert not decision.rigid
     assert known.sigmas[2] == pytest.approx(decision.measured_sigma)
     assert decision.measured_sigma == decision.log_scale_sigma

@@ -46,6 +46,8 @@ def test_a_stretched_source_is_named_with_its_axis(stretch: float, axis: int) ->
     np.testing.assert_allclose(found.matrix, wanted, atol=1.5e-3)
     assert found.spread == pytest.approx(abs(wanted[axis, axis]) * 1.5, abs=2e-3)
     assert f"({', '.join(f'{value:.1f}' for value in np.eye(3)[axis])})" in found.note()
+    noted = float(found.note().split(" by ")[1].split("%")[0])
+    assert noted == pytest.approx(150 * wanted[axis, axis], abs=0.25)
     cells = surface(source @ change).coarse[0]
     assert found.radius_m == pytest.approx(np.sqrt(cells.var(axis=0).sum()), rel=0.1)
     # A turn of a radius away is as large as the displacements.
