@@ -223,7 +223,7 @@ def test_an_error_that_all_points_share_hides_no_blunder() -> None:
     ("kind", "altitude_m", "shift_m", "ground_m", "causes"),
     [
         ("scenes", 520, (30, 0, 0), None, ("horizontal_shift",)),
-        ("scenes", 520, (0, 0, 45), None, ("height_system",)),
+        ("scenes", 520, (0.3, 0, 45), None, ("height_system",)),  # three standard deviations aside are none
         ("scenes", 520, (3, 0, 45), None, ("height_system", "horizontal_shift")),
         ("scenes", 520, (60, 0, 45), None, ("horizontal_shift", "height_system")),
         ("scenes", 520, (0, 0, 300), None, ("vertical_shift",)),
@@ -234,6 +234,7 @@ def test_an_error_that_all_points_share_hides_no_blunder() -> None:
         ("photos", 60, (0, 0, -120), 300, ("above_takeoff",)),  # more than heights above sea and ellipsoid differ
         ("photos", 60, (0, 0, -100), 300, ("height_system",)),
         ("photos", 400, (0, 0, -120), 300, ("vertical_shift",)),  # nobody flies 400 m above take-off
+        ("photos", 400, (0, 0, -350), 300, ("vertical_shift",)),
         ("scenes", 60, (0, 0, -400), 405, ("vertical_shift",)),
     ],
 )
@@ -246,6 +247,15 @@ def test_causes_of_shifts(
     ground = None if ground_m is None else np.array([ground_m, ground_m + 5.0])
     assert likely_causes(some, shift, HILL, ground) == causes
     assert likely_causes(some, replace(shift, shaped=False), HILL, ground) == ("shape",)
+
+
+def test_an_unsure_sea_level_is_no_other_height_system() -> None:
+    """200 m are more than heights above sea and above the ellipsoid differ, however unsure the sea level is."""
+    at = np.array([[0, 0, -1.0], [10, 0, 0], [0, 10, 1]])
+    some = replace(places([0.1] * 3, at), kinds=np.array(["scenes"] * 3), sea_m=np.full(3, 40.0))
+    covariance = np.diag([0.01, 0.01, 0.01 + 40.0**2])
+    shift = CommonShift(np.array([0, 0, 200.0]), covariance, -99.0, np.ones(3, dtype=bool))
+    assert likely_causes(some, shift, HILL, None) == ("vertical_shift",)
 
 
 def test_contradictions_are_kept_with_the_tie() -> None:
