@@ -22,7 +22,7 @@ from gsmap.types.change import Change, ChangeReport
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
-VERSION = 3
+VERSION = 4
 """Version, raised whenever the report on the same two captures changes."""
 
 

@@ -19,6 +19,7 @@ from gsmap.types.change import Change
 
 _GAIN = 0.08  # logarithm of an exposure gain that counts as different lighting
 _BY_M = 0.15  # a change is a piece of a larger change of its kind if half of it is within this distance
+_PRIOR_PIXELS = 10  # the mean difference of appearance is drawn to none as if by so many further pixels
 _SLIVER_M = 0.07  # changes thinner than this in two directions are edges that two trainings place differently
 
 
@@ -47,6 +48,7 @@ def make_change(
         "views_through": through / max(count, 1),
         "views_on": on / max(count, 1),
         "strength": float(np.mean(np.concatenate([c.strength[r] for c, r in zip(cells, rows, strict=True)]))),
+        "appearance": _appearance(both, moved if count else seen),
         "offset_m": float(np.median(np.r_[cells[0].offset_m[rows[0]], -cells[1].offset_m[rows[1]]])),
     } | one.evidence
     if one.paint is not None:
@@ -63,6 +65,18 @@ def make_change(
         _confidence(one, evidence),
         evidence,
     )
+
+
+def _appearance(both: tuple[SurfaceCells, SurfaceCells], rows: list[np.ndarray]) -> float:
+    """Return how much cells differ from the other capture, relative to the smallest difference that counts, from the
+    cameras of the capture that shows the smaller difference.
+
+    Args:
+        rows: cells of each capture.
+    """
+    strength = np.sum([side.appearance[r].sum(0) for side, r in zip(both, rows, strict=True)], axis=0)
+    pixels = np.sum([side.appearance_pixels[r].sum(0) for side, r in zip(both, rows, strict=True)], axis=0)
+    return float((strength / (pixels + _PRIOR_PIXELS)).min())
 
 
 def merge_pieces(changes: Sequence[Change], params: Params) -> list[Change]:

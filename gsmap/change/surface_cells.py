@@ -22,6 +22,7 @@ _MIN_CHROMA, _MIN_LIGHTNESS = 0.05, 0.15  # smallest differences, of colours in 
 _COLOUR_SIGMAS = 3.0  # largest difference due to exposure and noise, in robust standard deviations
 _CLIP_M = 0.15  # larger offsets come from another surface, not from noise
 _STEEPEST = 0.2  # smallest cosine of the viewing angle at which an offset is measured
+_MOST_DIFFERENT = 3.0  # a larger difference of appearance, relative to the smallest that counts, counts as this one
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,9 @@ class SurfaceCells:
         strength: (M,) size of the difference relative to the smallest that counts; texture that is shifted by a pixel
             is ignored.
         pixels: (M,) number of pixels that show the cell in both captures.
+        appearance: (M, 2) sums of the strength over the pixels that show the cell, with the other capture's surface on
+            it or behind it, from the cameras of this capture and from the other's.
+        appearance_pixels: (M, 2) numbers of these pixels.
     """
 
     rows: np.ndarray
@@ -50,6 +54,8 @@ class SurfaceCells:
     colour: np.ndarray
     strength: np.ndarray
     pixels: np.ndarray
+    appearance: np.ndarray
+    appearance_pixels: np.ndarray
 
     def __len__(self) -> int:
         return len(self.points)
@@ -101,6 +107,8 @@ class _Cells:
     colour: np.ndarray
     strength: np.ndarray
     pixels: np.ndarray
+    appearance: np.ndarray
+    appearance_pixels: np.ndarray
 
     @classmethod
     def of(cls, capture: CaptureViews) -> _Cells:
@@ -109,18 +117,22 @@ class _Cells:
         cell_of = np.full(len(capture.surface), -1, dtype=np.int64)
         cell_of[rows] = label
         m = len(counts)
-        return cls(rows, label, counts, cell_of, np.zeros(m), np.zeros((m, 3)), np.zeros(m), np.zeros(m))
+        shapes = ((m,), (m, 3), (m,), (m,), (m, 2), (m, 2))
+        return cls(rows, label, counts, cell_of, *(np.zeros(shape) for shape in shapes))
 
 
 def compare_surfaces(older: CaptureViews, newer: CaptureViews, seen: Observations) -> tuple[SurfaceCells, SurfaceCells]:
     """Accumulate the evidence on the surface cells of both captures."""
     cells = _Cells.of(older), _Cells.of(newer)
     limits = _limits(seen.balance)
-    # Use every second view of each capture, because neighbouring views along a path show the same content.
-    for picture in seen.newer_views[::2]:
-        _add(cells, (picture.other, picture.own), picture, seen, limits)
-    for picture in seen.older_views[1::2]:
-        _add(cells, (picture.own, picture.other), picture, seen, limits)
+    for own, pictures in ((1, seen.newer_views), (0, seen.older_views)):
+        for k, picture in enumerate(pictures):
+            views = (picture.own, picture.other) if own == 0 else (picture.other, picture.own)
+            colour, strength = _colour(views[0].colour, views[1].colour, seen.balance, limits)
+            # Every second view suffices for means of large surfaces, because neighbouring views show the same content.
+            if k % 2 != own:
+                _add(cells, views, picture, seen, colour, strength)
+            _add_appearance(cells, views, own, seen, strength)
     return (
         _side(older, cells[0], newer, seen.newer_views, seen.tolerance_m, seen.balance),
         _side(newer, cells[1], older, seen.older_views, seen.tolerance_m, None),
@@ -140,15 +152,15 @@ def _add(
     views: tuple[View, View],
     picture: ComparedView,
     seen: Observations,
-    limits: tuple[float, float],
+    colour: np.ndarray,
+    strength: np.ndarray,
 ) -> None:
-    """Add the views of the older and the newer capture from one camera."""
+    """Add the views of the older and the newer capture from one camera, and their differences; see `_colour`."""
     a, b = views
     base, share = seen.tolerance_m
     one = a.solid & b.solid & (a.dominant_id >= 0) & (b.dominant_id >= 0)
     one &= np.abs(a.depth - b.depth) <= base + share * a.depth
-    plain, beyond = _colour(a.colour, b.colour, seen.balance, limits)
-    difference, beyond = plain[one], beyond[one]
+    difference, beyond = colour[one], strength[one]
     offset = np.clip((b.depth - a.depth) * _along_normal(picture.own), -_CLIP_M, _CLIP_M)[one]
     for into, view, sign in zip(cells, views, (1.0, -1.0), strict=True):
         cell, count = into.cell_of[view.dominant_id[one]], len(into.pixels)
@@ -159,6 +171,24 @@ def _add(
         for k in range(3):
             into.colour[:, k] += np.bincount(cell, difference[shown, k], count)
         into.offset += np.bincount(cell, sign * offset[shown], count)
+
+
+def _add_appearance(
+    cells: tuple[_Cells, _Cells], views: tuple[View, View], own: int, seen: Observations, strength: np.ndarray
+) -> None:
+    """Add the strength of the differences from a camera of the older (``own`` 0) or the newer capture (1).
+
+    Each capture looks like the place from its own cameras, whatever shape its training gave to a blurred or seldom seen
+    surface. So a change shows from the cameras of both captures.
+    """
+    base, share = seen.tolerance_m
+    both, strength = views[0].opaque & views[1].opaque, np.minimum(strength, _MOST_DIFFERENT)
+    for k, (into, view, other) in enumerate(zip(cells, views, views[::-1], strict=True)):
+        shown = both & (view.dominant_id >= 0) & (view.depth < other.depth + base + share * view.depth)
+        cell = into.cell_of[view.dominant_id[shown]]
+        found, count = cell >= 0, len(into.pixels)
+        into.appearance_pixels[:, int(k != own)] += np.bincount(cell[found], minlength=count)
+        into.appearance[:, int(k != own)] += np.bincount(cell[found], strength[shown][found], count)
 
 
 def _colour(a: np.ndarray, b: np.ndarray, line: Balance, limits: tuple[float, float]):
@@ -236,4 +266,6 @@ def _side(
         cells.colour / counts_seen[:, None],
         cells.strength / counts_seen,
         cells.pixels,
+        cells.appearance,
+        cells.appearance_pixels,
     )

@@ -131,6 +131,16 @@ def test_the_faces_of_a_thin_wall_are_not_compared_with_each_other():
     assert found.kind == "recoloured"
 
 
+@pytest.mark.guards("answers")
+@pytest.mark.parametrize(("block", "found"), [((0.5, 0.5, 0.5), 0), ((0.8, 0.3, 0.2), 1)])
+def test_a_surface_that_looks_like_the_one_behind_it_is_no_change(block, found):
+    """A grey block before grey walls is what a blurred or seldom seen corner of an unchanged place looks like."""
+    grey = plain(0.5, 0.5, 0.5)
+    room = [*((*rectangle[:3], grey) for rectangle in shell()), *STAYS]
+    older = capture([*room, *box(0.5, 0.5, 0.3, 0.3, 0.3, 6, paint=plain(*block))], 1)
+    assert len(segments(change.compare(older, capture(room, 2)))) == found
+
+
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_capture_that_shows_nothing_or_a_wall_alone_says_nothing(count):
     whole = capture(shell(), 1)

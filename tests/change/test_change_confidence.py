@@ -13,17 +13,26 @@ from gsmap.types import Sim3
 from gsmap.types.change import Change
 
 SEEN = {"cells": 30.0, "looked_through": 20.0, "views_through": 3.0, "views_on": 0.0, "strength": 0.0, "slender": 0.0}
-PAINTED = {"cells": 60.0, "looked_through": 0.0, "views_through": 0.0, "views_on": 0.0, "strength": 4.0, "slender": 0.0}
+SEEN |= {"appearance": 2.0}
+PAINTED = SEEN | {"cells": 60.0, "looked_through": 0.0, "views_through": 0.0, "strength": 4.0}
 
 
 @pytest.mark.guards("answers")
 def test_more_that_speaks_for_a_change_makes_it_surer():
     sure = confidence(SEEN)
     assert 0.5 < sure < 1
-    for less in ({"looked_through": 4.0}, {"views_through": 1.0}, {"views_on": 3.0}, {"slender": 1.0}):
+    for less in (
+        {"looked_through": 4.0},
+        {"views_through": 1.0},
+        {"views_on": 3.0},
+        {"slender": 1.0},
+        {"appearance": 1.0},
+    ):
         assert confidence(SEEN | less) < sure
     assert confidence(SEEN | {"views_through": 0.7}) < 0.5  # Hardly one look proves nothing, however much it covers.
     assert confidence(SEEN | {"views_through": 6.0}) == confidence(SEEN | {"views_through": 20.0})
+    # What looks alike from the cameras of one capture is a difference of reconstruction, however often it was seen.
+    assert confidence(SEEN | {"views_through": 20.0, "appearance": 0.1}) < 0.5
     assert confidence(PAINTED | {"strength": 1.0}) < confidence(PAINTED) > confidence(PAINTED | {"cells": 6.0})
 
 
@@ -65,6 +74,8 @@ def test_a_smooth_thing_of_few_cells_is_one_thing():
         np.zeros((count, 3)),
         none,
         none,
+        np.zeros((count, 2)),
+        np.zeros((count, 2)),
     )
     cells, _ = classify_cells((side, side))
     (segment,) = find_segments(side, cells, np.zeros(count, dtype=bool), Params())

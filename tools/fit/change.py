@@ -2,6 +2,7 @@
 
     python -m tools.make.change DEV --set dev            # also dev-small, dev-false
     python -m tools.fit.change DEV/* --cache DIR                          # fits, and judges places left out of the fit
+    python -m tools.fit.change DEV/* --cache DIR --only alike             # fits one weight and keeps all others
     python -m tools.fit.change DEV/* --cache DIR --test TEST/*            # judges places no constant was chosen on
 
 Every change that comparing two captures under their true poses comes up with is one row, however unsure. It is right if
@@ -18,10 +19,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 
 from gsmap.change import VERSION, Params, compare
-from gsmap.change.confidence import pieces
+from gsmap.change.confidence import BASES, WEIGHTS, pieces
 from gsmap.types import PosedScene
 from tools.bench import change_scores as scores
 from tools.harness import argument_parser
@@ -57,18 +58,25 @@ def main() -> int:
     parser.add_argument("--test", type=Path, nargs="+", default=[], help="folders that are only judged")
     parser.add_argument("--cache", type=Path, required=True, help="keep what comparing came up with here")
     parser.add_argument("--ridge", type=float, default=0.01)
+    parser.add_argument("--only", help="fit the weight of this feature, without ridge; all others stay as they are")
     args = parser.parse_args()
+
+    def fitted(rows: list[Row]) -> tuple[float, dict[str, float]]:
+        return fit(rows, args.ridge) if args.only is None else fit_one(rows, args.only)
+
     rows = [row for folder in args.places for row in found_in(folder, args.cache)]
     for way in ("looked through", "painted"):
+        if args.only is not None and args.only not in WEIGHTS[way]:
+            continue
         mine = [row for row in rows if pieces(row.evidence)[0] == way]
-        base, weights = fit(mine, args.ridge)
+        base, weights = fitted(mine)
         told = ", ".join(f'"{name}": {weight:.2f}' for name, weight in weights.items())
         print(
             f"{way}: {sum(r.right for r in mine)} right, {sum(not r.right for r in mine)} wrong; {base:.2f}, {{{told}}}"
         )
         held = np.zeros(len(mine))
         for place in {row.place for row in mine}:
-            left = fit([row for row in mine if row.place != place], args.ridge)
+            left = fitted([row for row in mine if row.place != place])
             for k, row in enumerate(mine):
                 if row.place == place:
                     held[k] = probability(row, *left)
@@ -84,20 +92,13 @@ def found_in(folder: Path, cache: Path) -> list[Row]:
     """All that comparing the captures of a place comes up with."""
     kept = cache / f"{folder.name}-{VERSION}.json"
     if not kept.exists():
-        rows = [row for pair in _pairs(Truth(folder)) for row in _rows(Truth(folder), *pair)]
+        rows = [row for pair in itertools.combinations(Truth(folder).times, 2) for row in _rows(Truth(folder), *pair)]
         cache.mkdir(parents=True, exist_ok=True)
         kept.write_text(json.dumps([vars(row) for row in rows]))
         print(
             f"{folder.name}: {len(rows)} changes, {sum(row.right for row in rows)} right", file=sys.stderr, flush=True
         )
     return [Row(**{**row, "finds": tuple(row["finds"])}) for row in json.loads(kept.read_text())]
-
-
-def _pairs(truth: Truth) -> list[tuple[str, str]]:
-    times = truth.times
-    if any(truth.changes(times[0], time) for time in times[1:]):
-        return sorted({*itertools.pairwise(times), (times[0], times[-1])})
-    return [(times[0], time) for time in times[1:]]
 
 
 def _rows(truth: Truth, before: str, after: str) -> list[Row]:
@@ -135,6 +136,18 @@ def fit(rows: list[Row], ridge: float) -> tuple[float, dict[str, float]]:
 
     p = minimize(loss, np.zeros(1 + x.shape[1]), jac=True, method="L-BFGS-B").x
     return float(p[0]), dict(zip(names, p[1:].tolist(), strict=True))
+
+
+def fit_one(rows: list[Row], name: str) -> tuple[float, dict[str, float]]:
+    """Base and weights as `gsmap.change.confidence` has them, but for one that is fitted as by `fit`."""
+    way = pieces(rows[0].evidence)[0]
+    right = np.array([row.right for row in rows])
+    weight = np.where(right, 0.5 / max(right.sum(), 1), 0.5 / max((~right).sum(), 1))
+    told = [np.clip(probability(row, BASES[way], WEIGHTS[way] | {name: 0.0}), 1e-12, 1 - 1e-12) for row in rows]
+    odds, x = np.log(told) - np.log1p(-np.array(told)), np.array([pieces(row.evidence)[1][name] for row in rows])
+    sign = np.where(right, 1.0, -1.0)
+    best = minimize_scalar(lambda w: float(weight @ np.logaddexp(0, -sign * (odds + w * x)))).x
+    return BASES[way], WEIGHTS[way] | {name: float(best)}
 
 
 def probability(row: Row, base: float, weights: dict[str, float]) -> float:
