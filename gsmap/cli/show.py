@@ -87,11 +87,12 @@ def _report(m: Map, thing: str) -> SceneReport | PairReport | ChangeDetail | His
     from gsmap.map.changes import change_number
     from gsmap.store.objects import number_of
 
+    # A scene name may contain a colon, or look like a change; the id of a scene may begin like a change.
+    if change_number(thing) is not None and all(scene.name != thing for scene in m.scenes()):
+        return m.show_change(thing)
     try:
-        return m.show_scene(thing)  # a scene name may contain a colon, or look like a change
+        return m.show_scene(thing)
     except NotFoundError:
-        if change_number(thing) is not None:
-            return m.show_change(thing)
         if ":" in thing:
             return m.show_pair(thing)
         if number_of(thing) is not None:

@@ -109,7 +109,7 @@ def validated_facts(
     Raises:
         InputError: an empty text, control characters, an invalid date or scale.
     """
-    new = [] if name is None else [("name", validated_text("the name of a scene", name))]
+    new = [] if name is None else [("name", validated_scene_name(name))]
     if captured_at is not None:
         new.append(("captured_at", captured_at and validated_date(captured_at)))
     if note is not None:
@@ -135,6 +135,17 @@ def validated_text(what: str, text: str, *, lines: bool = False) -> str:
     if bad:
         raise InputError(f"{what} {text!r} has a control character ({bad[0]!r}): remove it", code="invalid_name")
     return text
+
+
+def validated_scene_name(name: str) -> str:
+    """Return a name that a scene may have: one that is safe to print and has not the form of a scene's id.
+
+    Raises:
+        InputError: it is no such name.
+    """
+    if len(name) == 32 and all(c in "0123456789abcdef" for c in name):
+        raise InputError(f"{name!r} has the form of the id of a scene: choose another name", code="invalid_name")
+    return validated_text("the name of a scene", name)
 
 
 def validated_date(when: str) -> str:

@@ -12,6 +12,8 @@ from gsmap.errors import InputError, NotFoundError
 from gsmap.store.catalog_rows import located_scene
 from gsmap.store.schema import scenes
 
+_MIN_PREFIX = 6  # digits of an id that are taken for it
+
 
 def living_ids(connection: Connection) -> set[str]:
     """Return the ids of the living scenes."""
@@ -55,13 +57,9 @@ def find(connection: Connection, ref: str) -> Row[Any]:
     """Return the row of a referenced scene; see `Scenes.get`."""
     if (known := located_scene(connection, ref)) is not None:
         return known
-    living = scenes.c.removed_at.is_(None)
-    row = connection.execute(select(scenes).where(scenes.c.name == ref, living)).first() or by_id(connection, ref)
-    if row is not None:
+    if (row := _exact(connection, ref)) is not None:
         return row
-    rows: Sequence[Row[Any]] = []
-    if ref and all(c in "0123456789abcdef" for c in ref):
-        rows = connection.execute(select(scenes).where(scenes.c.id.startswith(ref), living).limit(3)).all()
+    rows = _by_prefix(connection, ref, scenes.c.removed_at.is_(None))
     if len(rows) == 1:
         return rows[0]
     if rows:
@@ -75,12 +73,47 @@ def find(connection: Connection, ref: str) -> Row[Any]:
     )
 
 
+def find_any(connection: Connection, ref: str) -> Row[Any]:
+    """Return the row of a living scene, or else of a removed one; a name or whole id counts before an id prefix."""
+    if (row := _exact(connection, ref)) is not None:
+        return row
+    if _removed_by_name(connection, ref):
+        return find_removed(connection, ref)
+    with contextlib.suppress(NotFoundError):
+        return find(connection, ref)
+    return find_removed(connection, ref)
+
+
+def _exact(connection: Connection, ref: str) -> Row[Any] | None:
+    """Return the row of the scene with an id, or else of the living scene with a name."""
+    if (row := by_id(connection, ref)) is not None:
+        return row
+    named = select(scenes).where(scenes.c.name == ref, scenes.c.removed_at.is_(None))
+    return connection.execute(named).first()
+
+
+def _by_prefix(connection: Connection, ref: str, which: Any) -> Sequence[Row[Any]]:
+    """Return the rows whose id begins with ``ref``, which needs at least `_MIN_PREFIX` digits: fewer are a name."""
+    if len(ref) < _MIN_PREFIX or not is_hexadecimal(ref):
+        return []
+    return connection.execute(select(scenes).where(scenes.c.id.startswith(ref), which).limit(3)).all()
+
+
+def is_hexadecimal(text: str) -> bool:
+    return all(c in "0123456789abcdef" for c in text)
+
+
+def _removed_by_name(connection: Connection, ref: str) -> Sequence[Row[Any]]:
+    gone = scenes.c.removed_at.is_not(None)
+    return connection.execute(select(scenes).where(gone, scenes.c.name == ref)).all()
+
+
 def find_removed(connection: Connection, ref: str) -> Row[Any]:
     """Return the row of a removed scene by its id, id prefix, or last name."""
-    gone = scenes.c.removed_at.is_not(None)
-    named = connection.execute(select(scenes).where(gone, (scenes.c.id == ref) | (scenes.c.name == ref))).all()
-    if not named and ref and all(c in "0123456789abcdef" for c in ref):
-        named = connection.execute(select(scenes).where(gone, scenes.c.id.startswith(ref))).all()
+    row = by_id(connection, ref)
+    named: Sequence[Row[Any]] = [row] if row is not None and row.removed_at is not None else []
+    named = named or _removed_by_name(connection, ref)
+    named = named or _by_prefix(connection, ref, scenes.c.removed_at.is_not(None))
     if len(named) == 1:
         return named[0]
     if named:

@@ -37,7 +37,7 @@ from gsmap.store.scene_content import (
     stored_names,
     thinning_of,
 )
-from gsmap.store.scene_refs import by_id, find, find_living, find_removed, name_taken, unused_name
+from gsmap.store.scene_refs import by_id, find, find_any, find_living, find_removed, name_taken, unused_name
 from gsmap.store.schema import scenes
 from gsmap.stream import bounds as bounds_of
 from gsmap.stream import shift_origin, sorted_along_morton_curve
@@ -104,7 +104,7 @@ class Scenes:
         Raises:
             InputError: no Gaussians, an invalid name or date, or the name is in use and ``rename`` is off.
         """
-        facts.validated_text("the name of a scene", name)
+        facts.validated_scene_name(name)
         captured_at = None if captured_at is None else facts.validated_date(captured_at)
         if not gaussians.num_gaussians:
             raise InputError(f"scene {name!r} has no Gaussians", code="no_gaussians")
@@ -603,9 +603,7 @@ class Scenes:
             NotFoundError: no scene matches, or several do.
         """
         with self._catalog.read() as connection:
-            with contextlib.suppress(NotFoundError):
-                return _with_tags(connection, find(connection, ref))
-            return _with_tags(connection, find_removed(connection, ref))
+            return _with_tags(connection, find_any(connection, ref))
 
     def _update_date(self, known_id: str, captured_at: str | None, dated_by: str) -> Scene:
         """Update the date of a living scene that was ingested again.

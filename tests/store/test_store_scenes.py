@@ -9,7 +9,7 @@ from store_samples import make_cameras, make_gaussians
 from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.geometry.camera_models import camera_model, pinhole_views
 from gsmap.geometry.morton import morton_order
-from gsmap.store import Store, scene_content, scene_id
+from gsmap.store import Store, scene_content, scene_id, scene_refs
 from gsmap.store.chunk_boxes import chunk_boxes
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.types import Cameras, Gaussians
@@ -73,13 +73,27 @@ def test_refs(store, two_scenes):
             store.scenes.get(ref)
 
 
-def test_a_beginning_of_several_ids_is_refused(store):
+def test_a_beginning_of_several_ids_is_refused(store, monkeypatch):
+    monkeypatch.setattr(scene_refs, "_MIN_PREFIX", 1)  # instead of millions of scenes
     for i in range(20):  # of 20 ids two begin with the same of 16 digits
         store.scenes.add(make_gaussians(2, seed=i), make_cameras(), name=f"scene {i}")
     firsts = [s.id[0] for s in store.scenes.list()]
     twice = next(d for d in firsts if firsts.count(d) > 1)
     with raises(NotFoundError, code="scene_ambiguous"):
         store.scenes.get(twice)
+
+
+def test_few_digits_are_a_name_and_no_beginning_of_an_id(store):
+    """A scene called by digits that was removed must not lead to another whose id begins with them."""
+    kept, gone = (store.scenes.add(make_gaussians(2, seed=i), make_cameras(), name="x")[0] for i in range(2))
+    store.scenes.edit(gone.id, name=kept.id[:2])
+    store.scenes.remove(gone.id)
+    with raises(NotFoundError, code="scene_not_found"):
+        store.scenes.get(kept.id[:2])
+    assert store.scenes.find_any(kept.id[:2]).id == gone.id
+    assert store.scenes.find_any(kept.id[:6]).id == kept.id
+    with raises(InputError, code="invalid_name"):
+        store.scenes.edit(kept.id, name=gone.id)
 
 
 def test_names_stay_unique(store):
