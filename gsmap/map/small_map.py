@@ -50,10 +50,12 @@ from gsmap.map import static_filter
 from gsmap.map.comparison_pictures import note_target
 from gsmap.map.objects import MapObjects
 from gsmap.map.settings import Settings, settings_of
+from gsmap.map.stages.change import standing_comparisons
 from gsmap.map.stages.localize import Localizer, SearchRegion
 from gsmap.map.static_filter import find_dynamic_content
 from gsmap.methods import family
 from gsmap.store import Store
+from gsmap.store.change_rows import Comparison
 from gsmap.store.error_translation import translate_errors
 from gsmap.types import Cameras, Gaussians, Sim3
 from gsmap.types.localization import SceneFeatures
@@ -125,12 +127,13 @@ def export_small(
         )
     localizer = Localizer(store, settings, progress)
     scenes = sorted(localizer.placed)
-    passing = {} if known is None else find_dynamic_content(store, known)
+    passing = {} if known is None else find_dynamic_content(store, settings, known)
+    standing = standing_comparisons(store, settings) if known is None else []
     wanted: dict[str, int] = {}
     shown: dict[str, int] = {}
     for number, scene in enumerate(scenes):
         progress("export", 0.4 * number / len(scenes), f"what of {localizer.scenes[scene].name} shows")
-        whole = _scene_content(localizer, scene, passing.get(scene))
+        whole = _scene_content(localizer, scene, passing.get(scene), standing)
         wanted[scene], shown[scene] = whole.num_bytes, len(whole.gaussians)
     free = budget_bytes - _HEADER_BYTES * len(scenes) - 500
     factor = free / max(sum(wanted.values()), 1)
@@ -141,7 +144,7 @@ def export_small(
         files, rows = {}, []
         for number, scene in enumerate(scenes):
             progress("export", 0.4 + 0.5 * number / len(scenes), f"packing {localizer.scenes[scene].name}")
-            whole = _scene_content(localizer, scene, passing.get(scene))
+            whole = _scene_content(localizer, scene, passing.get(scene), standing)
             content, row = _packed(localizer, whole, factor * wanted[scene])
             files[scene] = content
             rows.append(row)
@@ -196,18 +199,21 @@ class _SceneContent:
         return len(_npz(features)) + len(_npz(packed_gaussians.pack(self.gaussians)))
 
 
-def _scene_content(localizer: Localizer, scene: str, passing: static_filter.DynamicContent | None) -> _SceneContent:
+def _scene_content(
+    localizer: Localizer, scene: str, passing: static_filter.DynamicContent | None, standing: Sequence[Comparison]
+) -> _SceneContent:
     """Return the content of a scene that a small map may store.
 
     Args:
         passing: dynamic content to leave out; None leaves out what changes show to be gone.
+        standing: the comparisons that hold.
     """
     store, placed = localizer.store, localizer.placed[scene]
     held = store.scenes.cameras(scene)
     own = None if held is None or held.synthesised else held
     features = placed.features
     if passing is None:
-        gone = _removed(store, scene)
+        gone = _removed(store, scene, standing)
     else:
         gone = static_filter.dynamic_rows(store, scene, passing)
         features = reduction.remove_features(features, placed.gaussians.means, gone)
@@ -217,10 +223,10 @@ def _scene_content(localizer: Localizer, scene: str, passing: static_filter.Dyna
     return _SceneContent(scene, features, kept, own, INDEXED_FEATURES)
 
 
-def _removed(store: Store, scene: str) -> np.ndarray | bool:
+def _removed(store: Store, scene: str, standing: Sequence[Comparison]) -> np.ndarray | bool:
     """Return a mask that is True for Gaussians that disappeared in later changes; all False without comparisons."""
     out: np.ndarray | bool = False
-    for comparison in store.changes.current():
+    for comparison in standing:
         if comparison.older != scene or not comparison.changes:
             continue
         found = store.changes.load(comparison.number).changes

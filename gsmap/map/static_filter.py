@@ -21,6 +21,7 @@ from gsmap.types.plain import canonical
 
 if TYPE_CHECKING:
     from gsmap.map.objects import MapObjects
+    from gsmap.map.settings import Settings
 
 _OF_THINGS = ("appeared", "disappeared", "moved", "replaced")
 """Kinds of changes that concern objects; recoloured surfaces and other lighting are static content."""
@@ -70,8 +71,10 @@ def _shared(a: np.ndarray, b: np.ndarray) -> float:
     return float(both / min((a[1] - a[0]).prod(), (b[1] - b[0]).prod()))
 
 
-def find_dynamic_content(store: Store, known: MapObjects) -> dict[str, DynamicContent]:
+def find_dynamic_content(store: Store, settings: Settings, known: MapObjects) -> dict[str, DynamicContent]:
     """Return the dynamic content of each placed scene, by scene id, reading only the catalog."""
+    from gsmap.map.stages.change import standing_comparisons
+
     graphs = {graph.scene: graph.key for graph in store.graphs.list()}
     things: dict[str, set[int]] = {}
     for thing in (*known.objects, *known.building):  # what could not be split may have moved, too
@@ -81,7 +84,7 @@ def find_dynamic_content(store: Store, known: MapObjects) -> dict[str, DynamicCo
                     things.setdefault(sighting.scene, set()).add(sighting.thing)
     changes: dict[str, list[tuple[int, int, str]]] = {}
     told: dict[str, list[str]] = {}
-    for one in store.changes.current():
+    for one in standing_comparisons(store, settings):
         for change in one.changes:
             if change.status == "rejected" or change.kind not in _OF_THINGS:
                 continue

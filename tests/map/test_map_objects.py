@@ -24,11 +24,11 @@ from gsmap.errors import ConfigError, DiskFullError, InputError, NotFoundError, 
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import Map
-from gsmap.map.objects import _numbered
+from gsmap.map.objects import _numbered, load_objects
 from gsmap.map.page_source import MapPageSource
 from gsmap.map.small_map import SmallLocalizer
 from gsmap.map.stages.objects import ComponentObjects
-from gsmap.map.static_filter import is_dynamic
+from gsmap.map.static_filter import find_dynamic_content, is_dynamic
 from gsmap.methods import RecipeKey
 from gsmap.store import Store, schema
 from gsmap.store.graphs import Graphs
@@ -495,6 +495,15 @@ def test_a_small_map_is_without_what_came_and_went(site: Map, tmp_path: Path) ->
             at = frame[scene].apply(points)
             assert num_near(at, *PLACES["table"]) <= 2
             assert num_near(at, *PLACES["stool"]) <= 2
+
+
+def test_comparisons_that_hold_no_longer_leave_nothing_out(site: Map, tmp_path: Path) -> None:
+    with gsmap.map.open(site.clone(tmp_path / "clone.gsmap").path) as m:
+        known = load_objects(m.store, m.settings)
+        assert any(one.changes for one in find_dynamic_content(m.store, m.settings, known).values())
+        for scene in m.scenes()[1:]:  # without dates no two visits are compared
+            m.edit(scene.name, captured_at="none")
+        assert not any(one.changes for one in find_dynamic_content(m.store, m.settings, known).values())
 
 
 def test_a_thinned_capture_still_tells_what_stood_there(site: Map, tmp_path: Path) -> None:

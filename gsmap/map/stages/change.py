@@ -104,6 +104,11 @@ def missing_comparisons(store: Store, asked: ComparisonPlan, settings: Settings)
     return [pair for pair in asked.pairs if pair not in done]
 
 
+def standing_comparisons(store: Store, settings: Settings) -> list[Comparison]:
+    """Return the comparisons of visits that hold: `gsmap changes` lists their changes, and exports may act on them."""
+    return _valid(store.changes.current(), plan_comparisons(store, settings), settings)
+
+
 def compare(
     store: Store, asked: ComparisonPlan, settings: Settings, progress: StageProgress, *, verify: bool = False
 ) -> int:

@@ -175,7 +175,7 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
         from gsmap.map.objects import load_objects
 
         known = load_objects(store, settings) if known is None else known
-        passing = {scene: one for scene, one in find_dynamic_content(store, known).items() if scene in scenes}
+        passing = {scene: one for scene, one in find_dynamic_content(store, settings, known).items() if scene in scenes}
         recipe = replace(recipe, without={scene: one.digest for scene, one in passing.items() if one.digest})
         notes += tuple(dynamic_notes(known, passing))
     exported = {pose.component for pose in placed.values()}
