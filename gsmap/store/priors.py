@@ -31,7 +31,7 @@ class Priors:
             )
         with self._catalog.write() as connection:
             scene = resolve(connection, prior.scene)
-            self._retire(connection, scene)
+            self.retire(connection, scene)
             row = {
                 "scene": scene,
                 "S_map_scene": from_pose(prior.S_map_scene),
@@ -81,10 +81,11 @@ class Priors:
             NotFoundError: it has none.
         """
         with self._catalog.write() as connection:
-            if not self._retire(connection, resolve(connection, ref)):
+            if not self.retire(connection, resolve(connection, ref)):
                 raise NotFoundError(f"scene {ref!r} has no prior", code="prior_not_found")
 
-    def _retire(self, connection: Connection, scene: str) -> int:
+    def retire(self, connection: Connection, scene: str) -> int:
+        """Mark the current prior of a scene as removed; return the number of priors that were current."""
         current = (priors.c.scene == scene) & priors.c.removed_at.is_(None)
         return int(connection.execute(update(priors).where(current).values(removed_at=now())).rowcount)
 

@@ -25,6 +25,8 @@ def inherit(store: Store, old: str, new: str) -> None:
     """
     with store.catalog.write() as connection:
         _inherit_facts(connection, old, new)
+        # Where the new content was superseded before, and returns, what held for it then holds no longer.
+        store.priors.retire(connection, new)
         current = (priors.c.scene == old) & priors.c.removed_at.is_(None)
         for row in connection.execute(select(priors).where(current)).mappings().all():
             content = {column: value for column, value in row.items() if column != "number"}
@@ -40,11 +42,13 @@ def inherit(store: Store, old: str, new: str) -> None:
 
 
 def _inherit_facts(connection: Connection, old: str, new: str) -> None:
-    """Merge the facts of both scenes in the order of time."""
+    """Merge the facts of both scenes in the order of time; those that both have are one."""
     both = facts.list_facts(connection, old), facts.list_facts(connection, new)
+    merged = merge_by_time(*both, time=lambda fact: fact.created_at)
+    once = dict.fromkeys((one.kind, one.value, one.author, one.created_at) for one in merged)
     rows = [
-        {"scene": new, "kind": one.kind, "value": one.value, "author": one.author, "created_at": one.created_at}
-        for one in merge_by_time(*both, time=lambda fact: fact.created_at)
+        {"scene": new, "kind": kind, "value": value, "author": author, "created_at": created_at}
+        for kind, value, author, created_at in once
     ]
     connection.execute(delete(scene_facts).where(scene_facts.c.scene == new))
     if rows:

@@ -112,3 +112,20 @@ def test_one_new_capture_at_a_time(site: Path, captures: Path, cli: Run, tmp_pat
     assert "is in the map already" in same.stderr
     assert cli("ingest", site, again(tmp_path), "--supersedes", "nobody").code == 1
     assert len(scenes(cli, site)) == 3
+
+
+def test_the_same_file_undoes_it_and_what_was_withdrawn_stays_so(site: Path, cli: Run, tmp_path: Path) -> None:
+    cli("prior", site, "left", "--anchor")
+    cli("reject", site, "left:right")
+    first = scenes(cli, site)["left"]["id"]
+    write_capture(tmp_path, "left", Sim3.identity(), *LEFT, seed=0)
+    with gsmap.map.open(site) as m:
+        m.ingest(again(tmp_path), supersedes="left")
+        m.confirm("left:right", withdraw=True)
+        m.remove_prior("left")
+        m.ingest(tmp_path / "left.ply", supersedes="left")
+        assert m["left"].id == first
+        assert {edge.review for edge in m.edge_rows()} == {None}
+        assert m.store.priors.list() == []
+        facts = m.store.scenes.facts(first)
+        assert len({(one.kind, one.value, one.created_at) for one in facts}) == len(facts)

@@ -109,8 +109,11 @@ def supersede(
         store.prepared_scenes.save(view.prepared, prepared_key().of(scene.id, key.digest))
         for one in carried:
             store.registrations.save(one.edge, one.key)
+            ends = one.edge.target, one.edge.source
             if one.review is not None:
-                store.registrations.review(one.edge.target, one.edge.source, one.review, one.note)
+                store.registrations.review(*ends, one.review, one.note)
+            elif (before := store.registrations.get(*ends)) is not None and before.review is not None:
+                store.registrations.review(*ends, "withdraw")  # of content that returns: withdrawn since
     progress("ingest", 1.0, f"{scene.name} in the place of {old.id[:12]}")
     held = [one.edge.status for one in carried if one.edge.S_target_source is not None]
     notes = [f"it replaced scene {old.id[:12]} ({old.name})"]
