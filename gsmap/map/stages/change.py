@@ -105,8 +105,8 @@ def missing_comparisons(store: Store, asked: ComparisonPlan, settings: Settings)
 
 
 def standing_comparisons(store: Store, settings: Settings) -> list[Comparison]:
-    """Return the comparisons of visits that hold: `gsmap changes` lists their changes, and exports may act on them."""
-    return _valid(store.changes.current(), plan_comparisons(store, settings), settings)
+    """Return the comparisons of visits that hold, by whatever recipe: exports may act on their changes."""
+    return _standing(store.changes.current(), plan_comparisons(store, settings))
 
 
 def compare(
@@ -147,17 +147,21 @@ def compare(
     return len(jobs)
 
 
-def _valid(current: Iterable[Comparison], asked: ComparisonPlan, settings: Settings) -> list[Comparison]:
-    """Return the comparisons that are up to date."""
+def _standing(current: Iterable[Comparison], asked: ComparisonPlan) -> list[Comparison]:
+    """Return the comparisons of pairs of the plan at their present poses, and with arrays."""
     pairs = set(asked.pairs)
     return [
         one
         for one in current
         if (one.older, one.newer) in pairs
         and one.whole
-        and one.key == _key(settings, asked, one.older, one.newer).digest
         and not has_moved(asked.visits[one.older], asked.visits[one.newer], one.S_newer_older)
     ]
+
+
+def _valid(current: Iterable[Comparison], asked: ComparisonPlan, settings: Settings) -> list[Comparison]:
+    """Return the comparisons that are up to date."""
+    return [one for one in _standing(current, asked) if one.key == _key(settings, asked, one.older, one.newer).digest]
 
 
 def _key(settings: Settings, asked: ComparisonPlan, older: str, newer: str) -> RecipeKey:
