@@ -187,7 +187,7 @@ def save_moved(m: Map, version: str) -> int:
         RecipeKey("change", version, {}).of(may.id, june.id),
         older=may.id,
         newer=june.id,
-        S_newer_older=Sim3.identity(),
+        S_newer_older=FRAMES["june"] @ FRAMES["may"].inverse(),
         S_frame_newer=Sim3.identity(),
     )
     return found.changes[0].number
