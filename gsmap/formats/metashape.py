@@ -55,7 +55,7 @@ def read(path: Path) -> Cameras:
         if len(numbers) != 16 or camera.get("sensor_id") not in models:
             continue
         pose = components.get(camera.get("component_id"), np.eye(4)) @ np.array(numbers).reshape(4, 4)
-        pose[:3, :3] /= np.cbrt(np.linalg.det(pose[:3, :3]))
+        pose[:3, :3] /= np.cbrt(np.abs(np.linalg.det(pose[:3, :3])))  # Cameras refuses a mirrored pose
         poses.append(pose)
         lenses.append(models[camera.get("sensor_id")])
         names.append(camera.get("label") or str(len(names)))

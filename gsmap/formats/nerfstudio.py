@@ -48,7 +48,8 @@ def parse(content: dict[str, Any], path: Path, dataparser: Path | None = None) -
     if pose.shape[1:] == (3, 4):
         pose = np.concatenate([pose, np.tile([[[0.0, 0, 0, 1]]], (len(pose), 1, 1))], axis=1)
     pose[:, :3, 1:3] *= -1  # OpenGL (y up, z back) to OpenCV (y down, z forward)
-    pose[:, :3, :3] /= np.cbrt(np.linalg.det(pose[:, :3, :3]))[:, None, None]
+    scales = np.cbrt(np.abs(np.linalg.det(pose[:, :3, :3])))  # without sign: Cameras refuses a mirrored pose
+    pose[:, :3, :3] /= scales[:, None, None]
 
     beside = dataparser or path.parent / DATAPARSER
     if beside.is_file():

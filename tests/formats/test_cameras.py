@@ -157,6 +157,12 @@ BAD = {
         "invalid_cameras",
         "camera 0 .*rigid",
     ),
+    "mirrored frame": (
+        '{"w": 4, "h": 4, "fl_x": 4, "frames": [{"file_path": "a", "transform_matrix": '
+        "[[-2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}]}",
+        "invalid_cameras",
+        "camera a .*rigid",
+    ),
     "no focal": (
         '{"w": 4, "h": 4, "frames": [{"file_path": "a", "transform_matrix": '
         "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}",

@@ -112,8 +112,9 @@ def test_metashape_lenses_that_colmap_lacks_are_named(tmp_path: Path, sensor: st
         ),
         metashape().replace('width="640"', 'width="x"'),
         metashape().replace("<f>500</f>", "<f>0</f>"),
+        metashape(component="<transform><rotation>-1 0 0 0 1 0 0 0 1</rotation></transform>"),
     ],
-    ids=("empty", "no chunk", "no cameras", "cut", "entities", "Earth-centred", "size", "focal length"),
+    ids=("empty", "no chunk", "no cameras", "cut", "entities", "Earth-centred", "size", "focal length", "mirrored"),
 )
 def test_damaged_metashape_files_are_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "cameras.xml").write_text(text)
