@@ -63,6 +63,7 @@ def write_points(
             colours = np.clip(rgb_of_sh0(gaussians.sh[:, 0]), 0, 1) * 65535
             record.red, record.green, record.blue = colours.round().astype(np.uint16).T
             record.intensity = (gaussians.opacities * 65535).round().astype(np.uint16)
+            record.return_number[:] = record.number_of_returns[:] = 1
             file.write_points(record)
             count += len(points)
     return count

@@ -67,6 +67,7 @@ def test_points_lie_where_they_truly_are(tied: Path, site: Site, tmp_path: Path,
     off, _ = cKDTree(truth - truth[0]).query(found - truth[0])
     assert np.quantile(off, 0.99) < 0.03
     assert points.red.max() > 255
+    assert set(points.return_number) == set(points.number_of_returns) == {1}  # LAS 1.4: numbers of returns begin at 1
 
 
 def test_points_in_another_crs(tied: Path, site: Site, tmp_path: Path) -> None:
