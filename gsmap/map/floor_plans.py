@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmap.geometry.boxes import box_corners
-from gsmap.geometry.transforms import transform_gaussians
 from gsmap.geometry.uncertainty import middle_covariance_m2
 from gsmap.report import Plan, PlanEdge, PlanScene, density_picture, make_plan, top_picture
 from gsmap.store import Store
@@ -45,11 +44,10 @@ def read_scene(store: Store, scene: Scene, *, whole: bool) -> SceneArrays:
     gaussians, kind = None, "boxes"
     points = box_corners(scene.bounds)
     if whole:
-        every = store.scenes.gaussians(scene.id)
-        gaussians, kind = replace(every, sh=every.sh[:, :1]), "rendered"
-        solid = np.flatnonzero((every.opacities > _SOLID) & np.isfinite(every.means).all(1))
+        gaussians, kind = store.scenes.unread(scene.id).degree_0(), "rendered"
+        solid = np.flatnonzero((gaussians.opacities > _SOLID) & np.isfinite(gaussians.means).all(1))
         if len(solid):
-            points = every.means[solid[:: -(-len(solid) // _SAMPLE)]].astype(np.float64)
+            points = gaussians.means[solid[:: -(-len(solid) // _SAMPLE)]].astype(np.float64)
     elif (graph := store.graphs.load(scene.id)) is not None:
         layer = graph.layers.get("landmarks") or graph.layers.get("landmarks:1") or graph.layers.get("objects")
         if layer is not None and len(layer):
@@ -94,9 +92,12 @@ def plan_of_component(
 def _with_picture(
     plan: Plan, poses: Sequence[ScenePose], arrays: Sequence[SceneArrays], longest_px: int
 ) -> tuple[Plan, str]:
-    whole = [(read.gaussians, pose) for read, pose in zip(arrays, poses, strict=True) if read.gaussians is not None]
-    if whole:
-        parts = [transform_gaussians(gaussians, pose.S_map_scene) for gaussians, pose in whole]
+    parts = [
+        (read.gaussians, pose.S_map_scene)
+        for read, pose in zip(arrays, poses, strict=True)
+        if read.gaussians is not None
+    ]
+    if parts:
         eyes = np.concatenate([pose.S_map_scene.apply(r.eyes) for r, pose in zip(arrays, poses, strict=True)])
         picture, kind = top_picture(parts, plan, eyes, longest_px), "rendered"
         note = "The picture shows the Gaussians from straight above, without ceilings."

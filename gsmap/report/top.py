@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -18,11 +17,11 @@ _FINER = 1.6  # supersampling factor of renders
 _INK = 128
 
 
-def top_picture(parts: Sequence[Gaussians], plan: Plan, eyes: np.ndarray, longest_px: int) -> bytes:
+def top_picture(parts: Sequence[tuple[Gaussians, Sim3]], plan: Plan, eyes: np.ndarray, longest_px: int) -> bytes:
     """Render Gaussians from above without ceilings, as WebP that fills the bounds of the plan.
 
     Args:
-        parts: Gaussians of each scene in the component frame.
+        parts: Gaussians of each scene in its own frame, and its pose ``S_map_scene``.
         plan: The floor plan.
         eyes: (T, 3) camera centres in the component frame; Gaussians well above them are left out.
         longest_px: Longer side of the picture in pixels.
@@ -31,8 +30,8 @@ def top_picture(parts: Sequence[Gaussians], plan: Plan, eyes: np.ndarray, longes
 
     from gsmap.render import render
 
-    S = Sim3(plan.R_plan_map, np.zeros(3), plan.metres_per_unit)
-    placed = Gaussians.concatenate([transform_gaussians(replace(part, sh=part.sh[:, :1]), S) for part in parts])
+    S_plan_map = Sim3(plan.R_plan_map, np.zeros(3), plan.metres_per_unit)
+    placed = Gaussians.concatenate([transform_gaussians(part.degree_0(), S_plan_map @ S) for part, S in parts])
     (low, high), means = plan.bounds, placed.means
     with np.errstate(invalid="ignore"):
         shown = np.isfinite(means).all(1) & (means[:, :2] > low).all(1) & (means[:, :2] < high).all(1)

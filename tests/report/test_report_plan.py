@@ -109,7 +109,9 @@ def test_the_picture_lies_where_the_plan_has_it_and_shows_no_ceiling():
     colours[-500:] = [0, 0, 1]
     plan = make_plan([shown(points)], [], None)
     eyes = np.column_stack([rng.uniform(0, 8, 20), rng.uniform(0, 3, 20), np.full(20, 1.6)])
-    picture = np.asarray(Image.open(io.BytesIO(top_picture([blobs(at, colours)], plan, eyes, 400))), float) / 255
+    S_map_scene = Sim3(exp_so3(rng.normal(size=3)), rng.normal(size=3), 1.0)
+    part = blobs(S_map_scene.inverse().apply(at), colours)
+    picture = np.asarray(Image.open(io.BytesIO(top_picture([(part, S_map_scene)], plan, eyes, 400))), float) / 255
     assert max(picture.shape[:2]) == 400
     x, y = (plan.place(red)[0, :2] - plan.bounds[0]) / (plan.bounds[1] - plan.bounds[0])
     pixel = picture[int((1 - y) * picture.shape[0]), int(x * picture.shape[1])]
