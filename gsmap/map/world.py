@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from gsmap.errors import ConfigError
 from gsmap.types import PoseGraph, Sim3
 from gsmap.types.plain import plain
 from gsmap.types.world import WorldFrame
@@ -20,21 +21,34 @@ class GeoreferencedComponent:
 
     Args:
         frame: the world frame.
-        S_world_map: component to world frame. S_ecef_map: to Earth-centred metres (EPSG:4978).
+        S_world_map: component to world frame. S_ecef_map: to Earth-centred metres (EPSG:4978), or the error that there
+            is no exact transformation.
     """
 
     frame: WorldFrame
     S_world_map: Sim3
-    S_ecef_map: Sim3
+    S_ecef_map: Sim3 | ConfigError
+
+    def on_globe(self) -> Sim3:
+        """Return ``S_ecef_map``.
+
+        Raises:
+            ConfigError: PROJ has no exact transformation to WGS 84.
+        """
+        if isinstance(self.S_ecef_map, ConfigError):
+            raise self.S_ecef_map
+        return self.S_ecef_map
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of ``tiles.json``, exact to the last bit."""
-        return {
+        out = {
             "crs": self.frame.crs,
             "origin": {k: v for k, v in plain(self.frame).items() if k != "crs"},
             "S_world_map": self.S_world_map.matrix().tolist(),
-            "S_ecef_map": self.S_ecef_map.matrix().tolist(),
         }
+        if isinstance(self.S_ecef_map, Sim3):
+            out["S_ecef_map"] = self.S_ecef_map.matrix().tolist()
+        return out
 
 
 def georeferenced_components(graph: PoseGraph | None, components: Collection[int]) -> dict[int, GeoreferencedComponent]:
@@ -44,7 +58,11 @@ def georeferenced_components(graph: PoseGraph | None, components: Collection[int
         if tie.component in components and tie.S_world_map is not None and tie.frame is not None:
             from gsmap.world.frame import T_ecef_frame
 
-            S_ecef_map = T_ecef_frame(tie.frame) @ tie.S_world_map
+            S_ecef_map: Sim3 | ConfigError
+            try:
+                S_ecef_map = T_ecef_frame(tie.frame) @ tie.S_world_map
+            except ConfigError as error:
+                S_ecef_map = error
             found[tie.component] = GeoreferencedComponent(tie.frame, tie.S_world_map, S_ecef_map)
     return found
 
@@ -59,6 +77,11 @@ def world_notes(found: Mapping[int, GeoreferencedComponent], format: str, up: st
         return ()
     named = ", ".join(sorted({one.frame.crs for one in found.values()}))
     turned = ", turned to x, -z, y" if up == "y" else ""
+    if lacking := {str(one.S_ecef_map) for one in found.values() if isinstance(one.S_ecef_map, ConfigError)}:
+        return (
+            f"tiles of {format} are in the map's frame{turned}: tiles.json has S_world_map, which leads to {named}, "
+            f"and no S_ecef_map: {'; '.join(sorted(lacking))}",
+        )
     return (
         f"tiles of {format} are in the map's frame{turned}, since the format has no room for coordinates in {named}: "
         "tiles.json has S_world_map and S_ecef_map beside them; 3dtiles carries its place itself",

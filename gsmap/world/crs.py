@@ -199,6 +199,8 @@ def transform_datum(source: Crs, target: Crs, points: np.ndarray) -> np.ndarray:
     """
     if source.geodetic == target.geodetic:
         return np.array(points, dtype=np.float64)
+    if len(points) and (grid := _better_grid(source.geodetic, target.geodetic, points)) is not None:
+        raise _needs(f"{source.text} to {target.text}", grid)
     return _through(source.geodetic, target.geodetic, points, f"{source.text} to {target.text}")
 
 
@@ -251,6 +253,42 @@ def _missing_grid(source: Any, target: Any) -> str | None:
         ways = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
     lacking = [] if ways.transformers else [grid for way in ways.unavailable_operations for grid in way.grids]
     return next((str(grid.short_name) for grid in lacking if not grid.available), None)
+
+
+def _better_grid(source: Any, target: Any, points: np.ndarray) -> str | None:
+    """Return the missing grid file of the best transformation between two datums at geodetic points (N, 3), where PROJ
+    would take a less accurate one.
+
+    Datums that count as equal by convention (NAD83 or GDA94 and WGS 84) stay so.
+    """
+    (west, south), (east, north) = np.floor(points[:, :2].min(0)), np.ceil(points[:, :2].max(0))
+    if not (-180 <= west <= east <= 180 and -90 <= south <= north <= 90):
+        return None
+    return _lacking_grid(source.to_wkt(), target.to_wkt(), float(west), float(south), float(east), float(north))
+
+
+@lru_cache(maxsize=64)
+def _lacking_grid(source: str, target: str, *area_deg: float) -> str | None:
+    from pyproj import CRS
+    from pyproj.transformer import AreaOfInterest, TransformerGroup
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        ways = TransformerGroup(
+            CRS.from_wkt(source),
+            CRS.from_wkt(target),
+            always_xy=True,
+            allow_ballpark=False,
+            area_of_interest=AreaOfInterest(*area_deg),
+        )
+    if ways.best_available or not ways.unavailable_operations or not ways.transformers:
+        return None
+    if any("proj=noop" in way.definition for way in ways.transformers):
+        return None
+    best = ways.unavailable_operations[0]
+    used = min((way.accuracy for way in ways.transformers if way.accuracy >= 0), default=float("inf"))
+    lacking = [grid for grid in best.grids if not grid.available]
+    return str(lacking[0].short_name) if lacking and 0 <= best.accuracy < used else None
 
 
 def _no_way(text: str, error: Exception) -> ConfigError:

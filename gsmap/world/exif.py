@@ -28,8 +28,8 @@ class PhotoPosition:
     Args:
         image: path of the photo.
         longitude_deg, latitude_deg: position on WGS 84.
-        height_m: height as in EXIF, or None.
-        above_ellipsoid: the height is above the ellipsoid (EXIF 3), not above sea level.
+        height_m: height above sea level, or None. EXIF 3 has codes for heights above the ellipsoid (0 and 1), which
+            meant sea level before and which writers still use for it.
         sigma_m: horizontal positioning error of the receiver, or None.
         height_sigma_m: vertical positioning error of the receiver, or None.
     """
@@ -38,7 +38,6 @@ class PhotoPosition:
     longitude_deg: float
     latitude_deg: float
     height_m: float | None
-    above_ellipsoid: bool
     sigma_m: float | None
     height_sigma_m: float | None = None
 
@@ -49,9 +48,8 @@ class PhotoPosition:
         common = max(params.gnss_common_sigma_m, self.sigma_m or 0.0)
         if self.sigma_m is not None and self.sigma_m < _CORRECTED_SIGMA_M:
             common = self.sigma_m
-        sea_level = 0.0 if self.above_ellipsoid else _SEA_LEVEL_SIGMA_M
         ratio = _HEIGHT_FACTOR if self.height_sigma_m is None else self.height_sigma_m / own
-        return (own, own * ratio), (common, common * ratio), sea_level
+        return (own, own * ratio), (common, common * ratio), _SEA_LEVEL_SIGMA_M
 
 
 def read_folder(folder: str | os.PathLike[str]) -> dict[str, PhotoPosition | None]:
@@ -91,7 +89,7 @@ def read(path: str | os.PathLike[str]) -> PhotoPosition | None:
         height = -height
     error = _number(gps.get(_ERROR))
     horizontal, vertical = rtk or (error if error and error > 0 else None, None)
-    return PhotoPosition(Path(path).as_posix(), longitude, latitude, height, code in (2, 3), horizontal, vertical)
+    return PhotoPosition(Path(path).as_posix(), longitude, latitude, height, horizontal, vertical)
 
 
 def _rtk_sigmas(xmp: bytes | str) -> tuple[float, float] | None:

@@ -338,6 +338,24 @@ def test_what_is_exported_says_where_it_lies(tied: Path, site: Site, tmp_path: P
     assert np.abs(np.array(sidecar["S_ecef_map"]) - transform).max() == 0
 
 
+def test_a_map_in_a_system_without_a_way_to_the_globe_is_exported(tied: Path, tmp_path: Path, monkeypatch) -> None:
+    """CGCS2000 has no transformation to WGS 84 in PROJ: only 3D Tiles need one."""
+    import gsmap.world.frame
+
+    def nowhere(frame: object) -> None:
+        raise ConfigError("PROJ knows no exact transformation", code="no_exact_transform")
+
+    monkeypatch.setattr(gsmap.world.frame, "T_ecef_frame", nowhere)
+    with gsmap.map.open(tied) as m:
+        m.export(tmp_path / "plain", tile_size_m=0, format="ply", merge="union")
+        with raises(ConfigError, code="no_exact_transform"):
+            m.export(tmp_path / "globe", tile_size_m=20, format="3dtiles", merge="union")
+    world = json.loads((tmp_path / "plain" / "tiles.json").read_text())["components"][0]["world"]
+    assert "S_world_map" in world
+    assert "S_ecef_map" not in world
+    assert not (tmp_path / "globe").exists()
+
+
 def test_tiles_move_on_the_globe_when_the_tie_does(tied: Path, tmp_path: Path) -> None:
     with gsmap.map.open(tied) as m:
         m.clone(tmp_path / "c.gsmap")

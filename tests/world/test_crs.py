@@ -8,7 +8,7 @@ from raising import raises
 
 from gsmap.errors import ConfigError, InputError
 from gsmap.types.world import WorldFrame
-from gsmap.world.crs import ECEF, WGS84, crs
+from gsmap.world.crs import ECEF, WGS84, crs, transform_datum
 from gsmap.world.frame import T_ecef_frame, frame_at, from_frame, to_frame
 
 UTM = np.array([[691234.1234, 5334567.7654, 519.321], [690234.1, 5334067.7, 529.321], [701234.1, 5344567.0, 719.3]])
@@ -126,6 +126,19 @@ def test_a_geoid_that_several_grids_lead_to_is_named(text: str) -> None:
     assert ("US survey feet" in system.heights) == text.endswith("6360")
     with raises(ConfigError, code="grid_missing"):
         system.to_geodetic(np.array([[775000.0, 2956000.0, 100.0]]))
+
+
+@pytest.mark.parametrize(("text", "at"), [("EPSG:27700", (1.716, 52.658)), ("EPSG:31467", (9.0, 50.0))])
+def test_a_datum_shift_without_its_grid_is_refused(text: str, at: tuple[float, float]) -> None:
+    """PROJ would else take a Helmert transformation that is off by metres, and say nothing."""
+    with raises(ConfigError, code="grid_missing"):
+        transform_datum(crs(WGS84), crs(text), np.array([[*at, 0.0]]))
+
+
+@pytest.mark.parametrize(("text", "at"), [("EPSG:26910", (-123.0, 45.0)), ("EPSG:2056", (7.4, 46.9))])
+def test_datums_that_are_equal_by_convention_or_by_an_exact_shift_are_used(text: str, at: tuple[float, float]) -> None:
+    found = transform_datum(crs(WGS84), crs(text), np.array([[*at, 0.0]]))
+    assert np.abs(found[0, :2] - at).max() < 0.01
 
 
 def test_a_height_system_without_its_grid_is_refused() -> None:

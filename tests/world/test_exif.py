@@ -30,7 +30,6 @@ def test_a_position_is_read(tmp_path: Path) -> None:
     assert (found.latitude_deg, found.longitude_deg) == pytest.approx((-48.137, 11.575))
     assert found.height_m == pytest.approx(520.5)
     assert found.sigma_m == pytest.approx(4.0)
-    assert not found.above_ellipsoid
     own, common, sea_level = found.sigmas(Params())
     assert own == pytest.approx((4.0, 8.0))
     assert common == pytest.approx((4.0, 8.0))
@@ -116,3 +115,14 @@ def test_a_folder_without_positions_is_refused(tmp_path: Path) -> None:
         exif.read_folder(tmp_path)
     with raises(InputError, code="folder_not_found"):
         exif.read_folder(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize(("reference", "height"), [(b"\0", 100.0), (b"\1", -100.0), (b"\2", 100.0), (b"\3", -100.0)])
+def test_heights_are_above_sea_level_whatever_exif_calls_them(tmp_path: Path, reference: bytes, height: float) -> None:
+    """EXIF 3: 2 and 3 are sea level; 0 and 1 became the ellipsoid, and are written for sea level still."""
+    found = exif.read(
+        photo(tmp_path / "a.jpg", t1="N", t2=(48.0, 8.0, 0), t3="E", t4=(11.0, 34.0, 0), t5=reference, t6=100.0)
+    )
+    assert found is not None
+    assert found.height_m == height
+    assert found.sigmas(Params())[2] == 40

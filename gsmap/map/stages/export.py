@@ -182,6 +182,9 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
     metres = {component: metre for component, metre in metres.items() if component in exported}
     notes += metre_notes(metres)
     world = georeferenced_components(graph, exported)
+    if recipe.is_tileset:
+        for one in world.values():
+            one.on_globe()
     notes += world_notes(world, request.format, recipe.up)
     tiles = plan_tiles(
         {scene: pose.S_map_scene for scene, pose in placed.items()},
@@ -325,7 +328,7 @@ def _export(
     layout: TreeLayout = Tiles3D(not request.uncompressed) if planned.recipe.is_tileset else StreamedSog()
     if planned.recipe.is_tree and is_stale(out, result.tiles, layout):
         in_metres_of = {component: metre.metres_per_unit for component, metre in planned.metres.items()}
-        S_ecef_map = {component: one.S_ecef_map for component, one in planned.world.items()}
+        S_ecef_map = {component: one.on_globe() for component, one in planned.world.items()}
         cameras, levels = partial(_cameras, store, planned), settings.export.levels
         progress(_TILES_SHARE, "levels of detail")
         if planned.recipe.is_tileset:
