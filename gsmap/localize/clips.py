@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from gsmap.errors import InputError, MissingDependencyError, NotFoundError
+from gsmap.geometry.camera_models import require_pycolmap
 from gsmap.localize.photos import Lens, make_photo
 from gsmap.types.localization import Photo
 
@@ -38,6 +39,9 @@ def read_clip(
 ) -> list[tuple[float, Photo]]:
     """Read frames of a clip, rotated as the clip specifies, with their times in seconds.
 
+    Args:
+        lens: in pixels of the upright frames of the clip, before they are downscaled.
+
     Raises:
         MissingDependencyError: PyAV is not installed.
         NotFoundError: no such file.
@@ -61,7 +65,28 @@ def read_clip(
         raise InputError(f"{path} is not a readable video clip ({error})", code="clip_unreadable") from error
     if not chosen:
         raise InputError(f"{path} has no readable frame", code="clip_unreadable")
-    return [(at, make_photo(rgb, None, lens, f"{path.name}#{at:.2f}")) for at, rgb in chosen]
+    return [
+        (at, make_photo(rgb, None, _scaled(lens, size_px, rgb.shape[1::-1]), f"{path.name}#{at:.2f}"))
+        for at, rgb, size_px in chosen
+    ]
+
+
+def _scaled(lens: Lens, size_px: tuple[int, int], new_size_px: tuple[int, int]) -> Lens:
+    """Return the lens of a frame that was resampled to a new width and height."""
+    if size_px == new_size_px:
+        return lens
+    x, y = new_size_px[0] / size_px[0], new_size_px[1] / size_px[1]
+    if lens.intrinsics_px is not None:
+        fx, fy, cx, cy = lens.intrinsics_px
+        lens = replace(lens, intrinsics_px=(fx * x, fy * y, cx * x, cy * y))
+    if lens.focal_px is not None:
+        lens = replace(lens, focal_px=lens.focal_px * max(new_size_px) / max(size_px))
+    if lens.model is not None and lens.model[1]:
+        name, params = lens.model
+        camera = require_pycolmap().Camera(model=name, width=size_px[0], height=size_px[1], params=list(params))
+        camera.rescale(*new_size_px)
+        lens = replace(lens, model=(name, tuple(camera.params.tolist())))
+    return lens
 
 
 def _require_size(path: Path, stream) -> None:  # type: ignore[no-untyped-def]
@@ -76,30 +101,35 @@ def _require_size(path: Path, stream) -> None:  # type: ignore[no-untyped-def]
     codec.options = {"max_pixels": str(_MAX_FRAME_PX)}
 
 
-def _sharpest(container, params: Params) -> list[tuple[float, np.ndarray]]:  # type: ignore[no-untyped-def]
-    """Return the frame with most fine detail of each interval, at most ``max_frames``, as (seconds, (H, W, 3) uint8).
+def _sharpest(  # type: ignore[no-untyped-def]
+    container, params: Params
+) -> list[tuple[float, np.ndarray, tuple[int, int]]]:
+    """Return the frame with most fine detail of each interval, at most ``max_frames``, as (seconds, (H, W, 3) uint8,
+    upright width and height before downscaling).
 
     The duration in the header may be wrong or missing. Whenever there are too many frames, the interval is doubled, and
     the sharper frame of each two neighbours is kept.
     """
     start = None
     interval_s = max(params.interval_s, float(container.duration or 0) / 1e6 / params.max_frames)
-    best: dict[int, tuple[float, float, np.ndarray]] = {}  # by interval: detail, seconds, pixels
+    best: dict[int, tuple[float, float, np.ndarray, tuple[int, int]]] = {}  # by interval: detail, seconds, pixels, size
     for number, frame in enumerate(container.decode(video=0)):
         at = float(frame.time) if frame.time is not None else number / 30.0
         start = at if start is None else start
         factor = min(1.0, params.max_side_px / max(frame.width, frame.height))
         size = (max(2, round(frame.width * factor)), max(2, round(frame.height * factor)))
         rgb = frame.to_ndarray(format="rgb24", width=size[0], height=size[1])
-        rgb = np.ascontiguousarray(np.rot90(rgb, round(getattr(frame, "rotation", 0) / 90) % 4))
+        quarters = round(getattr(frame, "rotation", 0) / 90) % 4
+        rgb = np.ascontiguousarray(np.rot90(rgb, quarters))
+        upright_px = (frame.height, frame.width) if quarters % 2 else (frame.width, frame.height)
         grey = rgb[::2, ::2].astype(np.float32).mean(2)
         detail = float(np.abs(np.diff(grey, 2, axis=0)).mean() + np.abs(np.diff(grey, 2, axis=1)).mean())
         interval = int((at - start) // interval_s)
         if interval not in best or detail > best[interval][0]:
-            best[interval] = detail, at, rgb
+            best[interval] = detail, at, rgb, upright_px
         while len(best) > params.max_frames:
             interval_s *= 2
-            longer: dict[int, tuple[float, float, np.ndarray]] = {}
+            longer: dict[int, tuple[float, float, np.ndarray, tuple[int, int]]] = {}
             for interval, one in best.items():
                 if interval // 2 not in longer or one[0] > longer[interval // 2][0]:
                     longer[interval // 2] = one

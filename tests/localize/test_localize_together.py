@@ -18,6 +18,7 @@ from gsmap.localize import Params, localize_together, probability, read_clip, ve
 from gsmap.localize import clips as reading
 from gsmap.localize import joint_localization as together_module
 from gsmap.localize.extractors import sift
+from gsmap.localize.photos import Lens
 from gsmap.localize.resection import retract_pose
 from gsmap_synthetic import film
 
@@ -164,6 +165,18 @@ def test_a_clip_gives_the_sharpest_frame_of_each_stretch(tmp_path) -> None:
     assert frames[0][1].size_px == (96, 64)
     small = read_clip(tmp_path / "a.mp4", params=reading.Params(interval_s=1.0, max_side_px=48))
     assert small[0][1].size_px == (48, 32)
+
+
+def test_intrinsics_of_a_clip_are_in_its_own_pixels(tmp_path) -> None:
+    clip(tmp_path / "a.mp4", np.full((3, 64, 96, 3), 128, np.uint8))
+    fisheye = ("OPENCV_FISHEYE", (90.0, 80, 50, 30, 0.02, 0, 0, 0))
+    for lens, want in (
+        (Lens((90.0, 80.0, 50.0, 30.0)), [45, 40, 25, 15]),
+        (Lens(focal_px=90.0), [45, 45, 24, 16]),
+        (Lens(model=fisheye), [45, 40, 25, 15]),
+    ):
+        ((_, photo),) = read_clip(tmp_path / "a.mp4", lens, reading.Params(max_side_px=48))
+        np.testing.assert_allclose(photo.intrinsics_px, want)
 
 
 @pytest.mark.parametrize(("name", "codec"), [("a.mp4", "mpeg4"), ("a.m4v", "mpeg4"), ("a.h264", "libx264")])
