@@ -125,7 +125,8 @@ def photo_in_memory(picture: Image | ArrayLike, lens: Lens | None = None, name: 
 
 def _panoramic(lens: Lens) -> Lens:
     """Return the lens of a photo whose metadata say that it is a panorama, unless another one was specified."""
-    return replace(lens, model=(EQUIRECTANGULAR, ())) if lens == Lens() else lens
+    is_given = lens.model or lens.intrinsics_px or lens.focal_px
+    return lens if is_given else replace(lens, model=(EQUIRECTANGULAR, ()))
 
 
 def _upright(picture: Image, *, in_place: bool) -> tuple[np.ndarray, object, bool]:
