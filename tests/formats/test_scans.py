@@ -91,6 +91,10 @@ def test_a_ply_that_promises_more_than_it_holds(tmp_path: Path) -> None:
         ("# x y z r g b\n1 2 3 255 0 51\n4 5 6 0 0 0\n", [[1, 0, 0.2], [0, 0, 0]]),
         ("//X,Y,Z,R,G,B\n1,2,3,255,0,51\n4,5,6,0,0,0\n", [[1, 0, 0.2], [0, 0, 0]]),
         ("2\n1 2 3 0.5 255 0 51\n4 5 6 0.25 0 0 0\n", [[1, 0, 0.2], [0, 0, 0]]),
+        ("1 2 3 7 255 0 51\n4 5 6 9 0 0 0\n", [[1, 0, 0.2], [0, 0, 0]]),  # an intensity of whole numbers
+        ("1 2 3 255 0 51 0.5\n4 5 6 0 0 0 1\n", [[1, 0, 0.2], [0, 0, 0]]),  # an intensity after the colour
+        ("1 2 3 0 0.6 0.8 255 0 51\n4 5 6 0 0 1 0 0 0\n", [[1, 0, 0.2], [0, 0, 0]]),  # normals, then the colour
+        ("1 2 3 0 0 1 255 0 51\n4 5 6 0 0 1 0 0 0\n", [[1, 0, 0.2], [0, 0, 0]]),
         ("1 2 3 0 0 1\n4 5 6 0 1 0\n", None),  # normals
     ],
 )
@@ -103,6 +107,7 @@ def test_text(tmp_path: Path, text: str, colours: list[list[float]] | None) -> N
         assert found.colours is None
     else:
         np.testing.assert_allclose(found.colours, colours, atol=1e-6)
+    assert len(found.notes) == ("0 0 1\n" in text or "3 7 255" in text)  # normals alone, or either order possible
 
 
 @pytest.mark.parametrize("text", ["", "hello\nworld\n", "1 2\n3 4\n", "1 2 3\n4 5\n"])

@@ -16,12 +16,14 @@ from gsmap.types.scan import Scan
 _MAX_HEAD_LINES = 20
 _MOST_BYTES = 4 << 30  # beyond it a text takes longer to read than anybody waits
 _BYTE = 255.0
+_COLOUR_STARTS = {4: (1, 0), 6: (0, 3, 1)}  # by the number of columns after x y z: intensity first, and normals first
 
 
 def read(path: Path) -> Scan:
     """Read points from the first three columns. Three more columns of whole numbers from 0 to 255, directly after the
-    point or after an intensity, are the colour. Spaces, commas or semicolons separate columns; lines before the first
-    point, and lines that begin with ``#`` or ``//``, are skipped.
+    point, after an intensity or after a normal, are the colour; of four such columns, the first is the intensity.
+    Spaces, commas or semicolons separate columns; lines before the first point, and lines that begin with ``#`` or
+    ``//``, are skipped.
 
     Raises:
         InputError: no numbers, fewer than three in a line, or lines of different lengths.
@@ -45,9 +47,12 @@ def read(path: Path) -> Scan:
     rows = rows[:: -(-total // limits.MAX_POINTS)] if total else rows
     points, rest = rows[:, :3], rows[:, 3:]
     notes: tuple[str, ...] = ()
-    colours = next((c for c in (rest[:, :3], rest[:, 1:4]) if _are_bytes(c)), None)
+    starts = _COLOUR_STARTS.get(rest.shape[1], (0, 1, 3))
+    colours = next((c for k in starts if _are_bytes(c := rest[:, k : k + 3])), None)
     if colours is None and rest.shape[1]:
-        notes = (f"columns 4 to {3 + rest.shape[1]} hold no colours from 0 to 255 and were not used",)
+        notes = (f"no colours from 0 to 255 were found in columns 4 to {3 + rest.shape[1]}, which were not used",)
+    elif rest.shape[1] == 4 and _are_bytes(rest[:, :3]) and _are_bytes(rest[:, 1:]):
+        notes = ("column 4 was read as the intensity, and columns 5 to 7 as the colour",)
     return scan_of(points, None if colours is None else colours / _BYTE, path, total, notes=notes)
 
 
