@@ -14,23 +14,31 @@ _SSIM_SIGMA_PX = 1.5
 _SSIM_RADIUS_PX = 5
 
 
-def psnr(image: np.ndarray, reference: np.ndarray) -> float:
-    """Return the peak signal-to-noise ratio in dB of two images (H, W, 3) in [0, 1]; infinite for equal images."""
+def psnr(image: np.ndarray, reference: np.ndarray, known: np.ndarray | None = None) -> float:
+    """Return the peak signal-to-noise ratio in dB of two images (H, W, 3) in [0, 1]; infinite for equal images.
+
+    Args:
+        known: (H, W) mask of pixels to compare; None for all.
+    """
     image, reference = _pair(image, reference)
-    error = np.mean((image - reference) ** 2)
+    squared = (image - reference) ** 2
+    error = np.mean(squared if known is None else squared[known])
     return float(-10 * np.log10(error)) if error > 0 else float("inf")
 
 
-def ssim(image: np.ndarray, reference: np.ndarray) -> float:
+def ssim(image: np.ndarray, reference: np.ndarray, known: np.ndarray | None = None) -> float:
     """Return the structural similarity of two images (H, W, 3) in [0, 1], averaged over channels and pixels.
 
     As in Wang et al. 2004: an 11 x 11 Gaussian window of 1.5 px, K1 = 0.01, K2 = 0.03, only where the window fits into
     the image.
 
+    Args:
+        known: (H, W) mask of pixels to compare; windows with other pixels do not count. None for all.
+
     Raises:
-        InputError: the images are smaller than the window.
+        InputError: the images, or their known parts, are smaller than the window.
     """
-    from scipy.ndimage import gaussian_filter
+    from scipy.ndimage import binary_erosion, gaussian_filter
 
     image, reference = _pair(image, reference)
     if min(image.shape[:2]) <= 2 * _SSIM_RADIUS_PX:
@@ -49,7 +57,13 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
     covariance = blur(image * reference) - mean_a * mean_b
     c1, c2 = 0.01**2, 0.03**2
     likeness = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
-    return float(np.mean(likeness / ((mean_a**2 + mean_b**2 + c1) * (variance_a + variance_b + c2))))
+    likeness /= (mean_a**2 + mean_b**2 + c1) * (variance_a + variance_b + c2)
+    if known is not None:
+        r = _SSIM_RADIUS_PX
+        likeness = likeness[binary_erosion(known, np.ones((2 * r + 1, 2 * r + 1)))[r:-r, r:-r]]
+        if not len(likeness):
+            raise InputError("SSIM needs 11 x 11 known pixels, and an image has none", code="picture_too_small")
+    return float(np.mean(likeness))
 
 
 class Lpips:

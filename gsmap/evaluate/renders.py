@@ -87,7 +87,7 @@ def compare_renders(
         gaussians, cameras: Gaussians and cameras in one frame.
         images: images by camera index, as arrays (H, W, 3) in [0, 1] or as paths. An image of another size than its
             camera is compared at its own size if the aspect ratios agree. The image of a camera with a lens is the
-            photo, which is undistorted.
+            photo, which is undistorted; PSNR and SSIM leave out pixels that the photo does not show.
         lpips: function that measures LPIPS, such as `gsmap.evaluate.images.Lpips`.
 
     Raises:
@@ -105,9 +105,10 @@ def compare_renders(
             image, known = undistort(image, camera)
         camera = _at_size(camera, image.shape[1], image.shape[0])
         rendered = render(gaussians, camera, depth=False, dominant_id=False, index=index).colour[0]
-        if known is not None:
+        if known is not None:  # LPIPS takes no mask
             image = np.where(known[..., None], image, rendered)
-        figures.append((psnr(rendered, image), ssim(rendered, image), lpips(rendered, image) if lpips else 0.0))
+        scores = psnr(rendered, image, known), ssim(rendered, image, known)
+        figures.append((*scores, lpips(rendered, image) if lpips else 0.0))
         if progress is not None:
             progress((done + 1) / len(images), f"image {done + 1} of {len(images)}")
     table = np.array(figures).reshape(-1, 3)

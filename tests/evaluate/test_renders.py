@@ -5,6 +5,7 @@ from raising import raises
 
 from gsmap.errors import InputError, NotFoundError
 from gsmap.evaluate.renders import compare_renders, find_images, read_image
+from gsmap.geometry.camera_models import camera_model, pinhole_views
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians
 
@@ -35,6 +36,18 @@ def test_a_scene_matches_its_own_renders_and_a_known_error_is_measured():
     assert off.means()["psnr_db"] == pytest.approx(-10 * np.log10(error), abs=1e-3)
     assert off.means()["lpips"] == 0.25
     assert off.names == ("right",)
+
+
+def test_pixels_that_a_photo_does_not_show_are_left_out():
+    """A fisheye shows half of each side face; the render is black but for Gaussians behind, the photo is grey."""
+    fisheye = camera_model("OPENCV_FISHEYE", 100, 100, (31.83, 31.83, 50, 50, 0, 0, 0, 0))
+    cameras = pinhole_views(fisheye, np.eye(4), "f.jpg")
+    behind = Gaussians([[0, 0, -50]], [[1, 0, 0, 0]], np.full((1, 3), -5), [0], np.zeros((1, 1, 3)))
+    photo = np.full((100, 100, 3), 0.1, np.float32)
+    found = compare_renders(behind, cameras, dict.fromkeys(range(len(cameras)), photo))
+    assert len(cameras) > 1
+    np.testing.assert_allclose(found.psnr_db, 20, atol=1e-4)
+    np.testing.assert_allclose(found.ssim, 1e-4 / (0.01 + 1e-4), rtol=1e-3)  # the luminance term of a constant error
 
 
 def test_pictures_are_found_by_camera_name_and_may_be_smaller(tmp_path):
