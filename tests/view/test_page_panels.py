@@ -434,7 +434,7 @@ def test_a_picked_place_tells_its_history_and_picked_things_are_chosen(hands):
 
 def test_a_length_is_measured_between_two_picked_places(hands):
     pick = "fake.pick({point: [%s], scene: null, thing: null})"
-    hands.press("m")
+    hands.click("button", "Measure a length")
     hands.says("Click the first end", "gs-notices")
     hands.value(pick % "1, 0, 0.5")
     hands.says("1.00, 0.00, 0.50 m", "gs-place")

@@ -364,7 +364,7 @@ export function measure(): void {
   const { pick, measureFrom } = page.state;
   if (measureFrom) page.set({ measureFrom: null, pick: null });
   else if (pick) page.set({ measureFrom: pick.point, pick: null });
-  else say("Click the first end of the length in the 3D view, then press m");
+  else say("Click the first end of the length in the 3D view, then “Measure from here” (m)");
 }
 
 export const hover = (object: string | null) => {
