@@ -67,10 +67,10 @@ class Revision:
     num_scenes: int
     num_placed: int
     num_components: int
-    num_used: int = 0
-    num_tentative: int = 0
-    num_unused: int = 0
-    num_undecided: int = 0
+    num_used: int
+    num_tentative: int
+    num_unused: int
+    num_undecided: int
     note: str = ""
     dropped_at: str | None = None
     key: str = ""

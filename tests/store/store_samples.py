@@ -111,7 +111,7 @@ def computed(*places, seed="") -> ComputedObjects:
             tuple(
                 ObjectObservation(scene, "seen", i, one[scene])
                 if scene in one
-                else ObjectObservation(scene, "absent", -1, None, 0.75)
+                else ObjectObservation(scene, "absent", -1, None, 0.75, next(iter(one)))
                 for scene in scenes
             ),
         )

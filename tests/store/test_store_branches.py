@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import threading
+from pathlib import Path
 
 import next_schema
 import pytest
@@ -13,6 +14,7 @@ from store_samples import key, make_cameras, make_gaussians
 
 from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.store import Store, purging, schema
+from gsmap.store.branches import locate
 from gsmap.types import PoseGraph, SceneGraph, ScenePose, Sim3
 
 
@@ -32,6 +34,17 @@ def revise(store):
     return store.revisions.save(
         PoseGraph({s.id: ScenePose(s.id, Sim3.identity(), 0, "placed") for s in store.scenes.list()})
     )
+
+
+def test_only_an_existing_map_has_branches(store, tmp_path):
+    """Everything else is a path: of a map that is made, say, in a folder with an @."""
+    for path in (tmp_path / "me@home.gsmap", tmp_path / "site@2.gsmap", f"{store.home}@a/b"):
+        found = locate(path)
+        assert (found.home, found.folder, found.branch) == (Path(path), Path(path), "")
+    (tmp_path / "site@2.gsmap").mkdir()
+    assert locate(tmp_path / "site@2.gsmap").folder == tmp_path / "site@2.gsmap"
+    with pytest.raises(NotFoundError):
+        locate(at(store, "none"))
 
 
 def test_a_branch_changes_nothing_of_the_map_and_copies_no_array(store):

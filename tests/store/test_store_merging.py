@@ -271,6 +271,17 @@ def test_a_merge_places_no_removed_scene(store, other):
         assert set(newest_poses(connection).poses) == {a}
 
 
+@pytest.mark.parametrize("mine_is_later", [True, False])
+def test_of_two_priors_of_a_scene_the_later_one_stays(store, other, mine_is_later):
+    for kept, sigma in ((other, 0.2), (store, 0.1)) if mine_is_later else ((store, 0.1), (other, 0.2)):
+        kept.priors.set(Prior(add(kept, 1), Sim3.identity(), np.full(7, sigma)))
+    merge(store, other)
+    (one,) = store.priors.list()
+    assert one.sigmas[0] == (0.1 if mine_is_later else 0.2)
+    assert merge(store, other).priors == 0, "nothing new"
+    assert [prior.sigmas[0] for prior in store.priors.list()] == [one.sigmas[0]]
+
+
 def test_a_prior_that_was_withdrawn_does_not_come_back_with_a_replacement(store):
     old, new, free = add(store, 1), add(store, 2), np.full(7, np.inf)
     for sigma in (0.5, 1.5):  # the first is replaced by the second

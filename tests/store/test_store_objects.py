@@ -26,9 +26,9 @@ def test_what_was_kept_is_read_as_it_was(store, scenes):
     (kept,) = store.objects.sets()
     assert [thing.id for thing in kept.objects] == ["o1", "o2"]
     assert list(kept.poses) == scenes
-    assert [(s.scene, s.state, s.looked) for s in kept.objects[1].sightings] == [
-        (may, "absent", 0.75),
-        (june, "seen", 1.0),
+    assert [(s.scene, s.state, s.looked, s.asked) for s in kept.objects[1].sightings] == [
+        (may, "absent", 0.75, june),
+        (june, "seen", 1.0, ""),
     ]
     np.testing.assert_array_equal(kept.objects[0].sightings[1].box, B)
 
