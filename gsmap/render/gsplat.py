@@ -285,7 +285,7 @@ def _draw(
 
 
 @dataclass(frozen=True, eq=False)
-class Projected:
+class Projection:
     """Gaussians projected into C images: (C, N, ...) attributes, or packed (M, ...), a row for each visible Gaussian
     of each image.
 
@@ -307,7 +307,7 @@ class Projected:
     gaussian: torch.Tensor | None = None
 
 
-def project(scene: DrawableGaussians, views: DeviceViews, packed: bool) -> Projected:
+def project(scene: DrawableGaussians, views: DeviceViews, packed: bool) -> Projection:
     """Project Gaussians into views with gsplat's functions, differentiably."""
     gs = load()
     projected = gs.fully_fused_projection(
@@ -337,7 +337,7 @@ def project(scene: DrawableGaussians, views: DeviceViews, packed: bool) -> Proje
         coefficients, mask = scene.sh[None], (radii > 0).all(-1)
     colours = gs.spherical_harmonics(math.isqrt(scene.sh.shape[1]) - 1, directions, coefficients, masks=mask)
     colours = torch.clamp_min(colours + 0.5, 0)
-    return Projected(radii, means2d, depths, conics, opacities, colours, camera, gaussian)
+    return Projection(radii, means2d, depths, conics, opacities, colours, camera, gaussian)
 
 
 def rasterize(

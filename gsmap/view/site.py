@@ -134,9 +134,8 @@ class _Maker:
                 for place, one in enumerate(graph["objects"]):
                     picture = None
                     if pictures and place < _OBJECT_PICTURES:
-                        picture = self.tried(
-                            f"object {one['id']}", lambda o=one: self.page_source.object_picture(o["id"])
-                        )  # type: ignore[misc]
+                        draw = partial(self.page_source.object_picture, one["id"])
+                        picture = self.tried(f"object {one['id']}", draw)
                     if picture is not None:
                         yield f"objects/{one['id']}.jpg", jpeg(picture)
                     objects.append({**one, "picture": None if picture is None else f"objects/{one['id']}.jpg"})
