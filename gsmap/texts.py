@@ -68,6 +68,11 @@ def _steers(c: str) -> bool:
     return category in _CATEGORIES or (category == _INVISIBLE and c not in _JOINERS)
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, such as ``1 photo`` and ``2 photos``."""
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
 def few(names: Sequence[str], most: int = 5) -> str:
     """List the first names, and the number of the remaining names."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

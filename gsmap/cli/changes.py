@@ -19,6 +19,7 @@ from gsmap.cli.console import (
     print_table,
     say,
 )
+from gsmap.texts import counted
 
 
 def command(
@@ -71,4 +72,4 @@ def command(
         print_table("changes", report.changes[0].columns, report.changes)
     if report.pairs:
         print_table("compared", report.pairs[0].columns, report.pairs)
-    say(f"{len(report.changes)} changes in {len(report.pairs)} pairs")
+    say(f"{counted(len(report.changes), 'change')} in {counted(len(report.pairs), 'pair')}")

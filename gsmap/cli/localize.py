@@ -19,6 +19,7 @@ from gsmap.cli.console import (
     progress_bars,
     say,
 )
+from gsmap.texts import counted
 
 if TYPE_CHECKING:
     from gsmap.types.rows.localize import LocalizeReport
@@ -154,7 +155,8 @@ def command(
         )
     _tell(report, json)
     if add and not json:
-        say(f"{sum(bool(row.added) for row in report.results)} photos kept; gsmap list {map} photos lists them")
+        kept = counted(sum(bool(row.added) for row in report.results), "photo")
+        say(f"{kept} kept; gsmap list {map} photos lists them")
 
 
 def _tell(report: LocalizeReport, json: bool) -> None:

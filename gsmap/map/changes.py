@@ -19,6 +19,7 @@ from gsmap.map.settings import Settings
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
 from gsmap.store.change_rows import Comparison, StoredChange
+from gsmap.texts import counted
 from gsmap.types import Change, PoseGraph, Scene
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow
@@ -99,9 +100,9 @@ def changes_report(
     never = missing - {(one.older, one.newer) for one in chosen}
     notes = list(asked.notes)
     if stale:
-        notes.append(f"{len(stale)} pairs were compared by another recipe or at other poses: {_WRITE}")
+        notes.append(f"{counted(len(stale), 'pair')} compared by another recipe or at other poses: {_WRITE}")
     if never:
-        notes.append(f"{len(never)} pairs are not compared yet: {_WRITE}")
+        notes.append(f"{counted(len(never), 'pair')} not compared yet: {_WRITE}")
     if chosen and placed is not None:
         mine = {placed.poses[one.newer].component for one in chosen if one.newer in placed.poses}
         notes += metre_notes({component: metre for component, metre in metres.items() if component in mine})

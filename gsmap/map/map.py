@@ -20,6 +20,7 @@ from gsmap.map.metric_scales import metres_at
 from gsmap.map.progress_logging import log_progress
 from gsmap.map.shared_jobs import announce_work
 from gsmap.store import Store
+from gsmap.texts import counted
 from gsmap.types import Cameras, Change, Gaussians, PoseGraph, Prior, Scene, SceneGraph, ScenePose, Sim3
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.progress import StageProgress
@@ -823,7 +824,7 @@ class Map(AbstractContextManager["Map"]):
             with announce_work(self.store, "changes"):
                 compare(self.store, asked, self.settings, self._progress)
         elif missing := len(missing_comparisons(self.store, asked, self.settings)):
-            told += (f"{missing} pairs of visits are not compared, and the map is open for reading only",)
+            told += (f"{counted(missing, 'pair')} of visits not compared, and the map is open for reading only",)
         return compute_objects(self.store, self.settings, self._progress), told
 
     def export_small(self, out: str | os.PathLike[str], budget_bytes: int, *, static: bool = False) -> SmallMapReport:

@@ -18,6 +18,7 @@ from gsmap.map.photos import PhotoObservation, localized_photo_of, small_jpeg
 from gsmap.map.scan_localization import scan_rows
 from gsmap.map.stages.localize import Localizer, SearchRegion, localize, localize_all, parse_near
 from gsmap.store import Store
+from gsmap.texts import counted
 from gsmap.types.localization import LocalizationResult, Photo
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.localize import LocalizeReport, LocalizeRow
@@ -180,9 +181,9 @@ def lens_notes(named: Sequence[tuple[str, Photo]]) -> list[str]:
         bent = sum(photo.lens == model and not photo.faces for _, photo in named)
         wide = sum(photo.lens == model and bool(photo.faces) for _, photo in named)
         if bent:
-            notes.append(f"{bent} photos were undistorted ({model}); intrinsics are those of the undistorted photos")
+            notes.append(f"{counted(bent, 'photo')} undistorted ({model}); the intrinsics are those after it")
         if wide:
-            notes.append(f"{wide} photos were localized by pinhole faces of 90 degrees ({model})")
+            notes.append(f"{counted(wide, 'photo')} localized by pinhole faces of 90 degrees ({model})")
     return notes
 
 

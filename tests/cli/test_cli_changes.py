@@ -19,7 +19,7 @@ def test_changes_are_told_with_what_is_not_known(site: Path, cli: Run) -> None:
     assert "left:right" in shown.stdout
     assert "odd:one has no date: which one is newer is not known" in shown.stderr
     assert "left:right: it was dark" in shown.stderr
-    assert "1 changes in 1 pairs" in shown.stderr
+    assert "1 change in 1 pair" in shown.stderr
     data = cli("changes", site, "left:right", "--json").json
     (change,) = data["changes"]
     assert (change["id"], change["kind"], change["status"], change["confidence"]) == ("c1", "moved", "open", 0.875)

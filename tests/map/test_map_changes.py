@@ -241,7 +241,7 @@ def test_a_map_that_cannot_be_written_tells_what_it_knows(
     with Map(gsmap.map.map.Store.open(site.store.home, "r")) as m:
         report = m.changes()
         assert [pair.pair for pair in report.pairs] == ["may:june"]
-        assert report.notes == ("1 pairs are not compared yet: run gsmap changes with write access to the map",)
+        assert report.notes == ("1 pair not compared yet: run gsmap changes with write access to the map",)
     assert seen.pairs == names_before
 
 

@@ -136,7 +136,7 @@ export class Review extends Panel {
       ${
         state.map?.stale
           ? html`<p class="small">
-              The poses are older than what was reviewed. Optimizing takes it in and makes a new revision.
+              The poses are older than the edges, reviews or priors. Optimizing makes a new revision of them.
             </p>`
           : nothing
       }
