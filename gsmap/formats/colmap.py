@@ -16,7 +16,7 @@ import numpy as np
 from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats.camera_files import unique
-from gsmap.formats.lenses import pinhole_cameras
+from gsmap.formats.lenses import photo_cameras, pinhole_cameras
 from gsmap.geometry.camera_models import camera_model, require_pycolmap
 from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
 from gsmap.types import Cameras
@@ -78,8 +78,8 @@ def read(folder: str | os.PathLike[str]) -> Cameras:
 def write(folder: str | os.PathLike[str], cameras: Cameras) -> None:
     """Write cameras as a COLMAP model in text, without points: ``cameras.txt``, ``images.txt``, ``points3D.txt``.
 
-    Poses are in the cameras' own frame; images are numbered from 1 in their order, and those of equal size and
-    intrinsics share a camera. White space in a name becomes ``_``: COLMAP's text format ends a name there.
+    Poses are in the cameras' own frame; images are the photos with their lenses, numbered from 1 in their order, and
+    those of equal lenses share a camera. White space in a name becomes ``_``: COLMAP's text format ends a name there.
 
     Raises:
         InputError: The folder holds a binary model, which programs would read instead.
@@ -94,19 +94,20 @@ def write(folder: str | os.PathLike[str], cameras: Cameras) -> None:
         )
     if not folder.parent.is_dir():
         raise NotFoundError(f"cannot write {folder}: no such folder: {folder.parent}", code="folder_not_found")
-    calibrations: dict[tuple[float, ...], int] = {}
+    calibrations: dict[CameraModel, int] = {}
+    photos, poses, models = photo_cameras(cameras)
     images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# POINTS2D[] as X Y POINT3D_ID"]
-    quats = matrices_to_quats(cameras.T_camera_frame[:, :3, :3])
+    quats = matrices_to_quats(poses[:, :3, :3].transpose(0, 2, 1))
     # With the rotation that the quaternion says, so that the centre stays where it is.
-    translations = -np.einsum("cij,cj->ci", quats_to_matrices(quats), cameras.centers)
-    names = unique(["_".join(name.split()) or "_" for name in cameras.names])
+    translations = -np.einsum("cij,cj->ci", quats_to_matrices(quats), poses[:, :3, 3])
+    names = unique(["_".join(name.split()) or "_" for name in photos])
     for i, name in enumerate(names):
-        shape = (*cameras.sizes_px[i].tolist(), *cameras.intrinsics_px[i].tolist())
-        camera = calibrations.setdefault(shape, len(calibrations) + 1)
+        camera = calibrations.setdefault(models[i], len(calibrations) + 1)
         pose = " ".join(repr(value) for value in (*quats[i].tolist(), *translations[i].tolist()))
         images += [f"{i + 1} {pose} {camera} {name}", ""]
     lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]
-    lines += [f"{camera} PINHOLE {' '.join(map(repr, shape))}" for shape, camera in calibrations.items()]
+    for model, camera in calibrations.items():
+        lines.append(f"{camera} {model.name} {' '.join(map(repr, (*model.size_px, *model.params)))}")
     folder.mkdir(exist_ok=True)
     _write_lines(folder / "cameras.txt", lines)
     _write_lines(folder / "points3D.txt", ["# POINT3D_ID X Y Z R G B ERROR TRACK[] as IMAGE_ID POINT2D_IDX"])

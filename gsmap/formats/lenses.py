@@ -1,4 +1,4 @@
-"""View the photos of camera files through pinholes, whatever their lens, and say so in notes."""
+"""View the photos of camera files through pinholes, whatever their lens, and say so in notes; and the reverse."""
 
 from __future__ import annotations
 
@@ -12,6 +12,21 @@ from gsmap.types import Cameras
 from gsmap.types.cameras import CameraModel
 
 _MIN_SHIFT_PX = 0.01
+
+
+def photo_cameras(cameras: Cameras) -> tuple[list[str], np.ndarray, list[CameraModel]]:
+    """Return the names of the P photos that cameras show, their camera-to-frame poses (P, 4, 4) and their lenses."""
+    rows = [rows[0] for rows in cameras.photo_rows.values()]
+    poses, models = cameras.T_frame_camera[rows], []
+    for pose, row in zip(poses, rows, strict=True):
+        lens = cameras.lenses[row] if cameras.lenses else None
+        if lens is None:
+            width, height = cameras.sizes_px[row].tolist()
+            models.append(CameraModel("PINHOLE", (width, height), tuple(cameras.intrinsics_px[row].tolist())))
+        else:
+            pose[:3, :3] = pose[:3, :3] @ lens.R_photo_camera.T
+            models.append(lens.model)
+    return list(cameras.photo_rows), poses, models
 
 
 def pinhole_cameras(

@@ -13,7 +13,7 @@ import numpy as np
 from gsmap.durable import write_text_output
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats.camera_files import load_json, unique
-from gsmap.formats.lenses import pinhole_cameras
+from gsmap.formats.lenses import photo_cameras, pinhole_cameras
 from gsmap.formats.pictures import open_picture
 from gsmap.geometry.camera_models import EQUIRECTANGULAR, camera_model
 from gsmap.types import Cameras, Sim3
@@ -21,6 +21,17 @@ from gsmap.types.cameras import CameraModel
 
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
+# Keys of the parameters of COLMAP's models, in COLMAP's order; further parameters must be zero.
+_MIDDLE, _SIMPLE = ("fl_x", "fl_y", "cx", "cy"), ("fl_x", "cx", "cy")
+_KEYS = {
+    "SIMPLE_PINHOLE": _SIMPLE,
+    "PINHOLE": _MIDDLE,
+    "SIMPLE_RADIAL": (*_SIMPLE, "k1"),
+    "RADIAL": (*_SIMPLE, "k1", "k2"),
+    "OPENCV": (*_MIDDLE, "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": (*_MIDDLE, "k1", "k2", "p1", "p2", "k3"),
+    "OPENCV_FISHEYE": (*_MIDDLE, "k1", "k2", "k3", "k4"),
+}
 DATAPARSER = "dataparser_transforms.json"
 
 
@@ -70,25 +81,50 @@ def parse(content: dict[str, Any], path: Path, dataparser: Path | None = None) -
 def write(path: str | os.PathLike[str], cameras: Cameras) -> None:
     """Write a ``transforms.json`` (OpenGL axes) with poses in the frame of ``cameras`` and intrinsics per image.
 
-    A camera's name is its ``file_path``, relative to the file. Nerfstudio centres and scales poses as it loads them;
+    Frames are the photos with their lenses: all perspective, all fisheye or all equirectangular, as nerfstudio needs. A
+    photo's name is its ``file_path``, relative to the file. Nerfstudio centres and scales poses as it loads them;
     ``--orientation-method none --center-method none --auto-scale-poses False`` keeps the frame.
 
     Raises:
         NotFoundError: The parent folder is missing.
+        InputError: Lenses that the format does not have, or of several kinds.
     """
     path = Path(path)
     if not path.parent.is_dir():
         raise NotFoundError(f"cannot write {path}: no such folder: {path.parent}", code="folder_not_found")
-    pose = cameras.T_frame_camera.copy()
+    names, pose, models = photo_cameras(cameras)
     pose[:, :3, 1:3] *= -1  # OpenCV (y down, z forward) to OpenGL (y up, z back)
-    frames = []
-    for i, name in enumerate(cameras.names):
+    kinds, frames = set(), []
+    for i, (name, model) in enumerate(zip(names, models, strict=True)):
+        kinds.add(model.name if model.name in ("PINHOLE", "OPENCV_FISHEYE", EQUIRECTANGULAR) else "OPENCV")
         frame: dict[str, Any] = {"file_path": name}
-        frame |= dict(zip(("w", "h"), cameras.sizes_px[i].tolist(), strict=True))
-        frame |= dict(zip(("fl_x", "fl_y", "cx", "cy"), cameras.intrinsics_px[i].tolist(), strict=True))
-        frames.append(frame | {"transform_matrix": pose[i].tolist()})
-    text = json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1)
+        frame |= dict(zip(("w", "h"), model.size_px, strict=True))
+        frames.append(frame | _frame_lens(model, path) | {"transform_matrix": pose[i].tolist()})
+    if "OPENCV" in kinds:
+        kinds.discard("PINHOLE")
+    if len(kinds) > 1:
+        raise InputError(
+            f"{path} takes photos of one kind of lens, and these are of {', '.join(sorted(kinds))}: write a COLMAP "
+            "model (--format colmap)",
+            code="unsupported_output",
+        )
+    text = json.dumps({"camera_model": "".join(kinds) or "PINHOLE", "frames": frames}, indent=1)
     write_text_output(path, text)
+
+
+def _frame_lens(model: CameraModel, path: Path) -> dict[str, float]:
+    """Return the intrinsics and distortion of a lens by nerfstudio's keys."""
+    if model.name == EQUIRECTANGULAR:
+        width, height = model.size_px
+        return dict(zip(_MIDDLE, (width / 2, float(height), width / 2, height / 2), strict=True))
+    keys = _KEYS.get(model.name, ())
+    if not keys or any(model.params[len(keys) :]):
+        raise InputError(
+            f"{path} cannot hold photos of the lens {model.name}: write a COLMAP model (--format colmap)",
+            code="unsupported_output",
+        )
+    out = dict(zip(keys, model.params, strict=False))
+    return {"fl_x": out["fl_x"], "fl_y": out["fl_x"]} | out
 
 
 def _rows_to_matrix(rows: list[list[float]]) -> np.ndarray:

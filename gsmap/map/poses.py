@@ -38,7 +38,8 @@ def write_poses(store: Store, out: Path, format: str, crs: str | None = None) ->
       none), at the time of capture in Unix seconds where all scenes have a date, else at 0, 1, 2, ... in the order of
       names; scenes of one date are spread over the time to the next, at most a second apart.
     - ``g2o``: a vertex per scene and an edge per edge in use, with its information; rigid components only.
-    - ``colmap``, ``nerfstudio``: every camera of every scene in the map frame and unit, named ``scene/camera``.
+    - ``colmap``, ``nerfstudio``: every photo of every scene in the map frame and unit, with its lens, named
+      ``scene/photo``. Scenes without photos, whose cameras were synthesized, are left out, which is logged.
     - ``json``: what ``gsmap poses MAP --json`` prints.
 
     ``tum`` and ``g2o`` are in metres where the metre of the component is known to better than a factor, else in the
@@ -48,7 +49,7 @@ def write_poses(store: Store, out: Path, format: str, crs: str | None = None) ->
 
     Raises:
         ConfigError: another format.
-        NotFoundError: no scene has a pose yet.
+        NotFoundError: no scene has a pose yet, or photos are to be written and no scene has any.
         InputError: a pose that the format cannot say, or several components for one pipe.
     """
     if format not in FORMATS:
@@ -70,6 +71,13 @@ def write_poses(store: Store, out: Path, format: str, crs: str | None = None) ->
         text = json.dumps({"schema": SCHEMA, "poses": rows}, indent=1)
         write_text_output(out, text, store.id)
         return [out]
+    if format in ("colmap", "nerfstudio"):
+        bare = [scenes[pose.scene].name for pose in placed if scenes[pose.scene].cameras_synthesised]
+        placed = [pose for pose in placed if not scenes[pose.scene].cameras_synthesised]
+        if not placed:
+            raise NotFoundError("no scene of the map has photos with cameras to write", code="no_cameras")
+        if bare:
+            _log.warning("%s: left out %s, captured without cameras of photos", out, few(sorted(bare)))
     components = sorted({pose.component for pose in placed})
     if len(components) > 1 and is_stream(out):
         raise InputError(
@@ -181,10 +189,14 @@ def _edges(store: Store, members: Sequence[ScenePose], used: set[tuple[str, str]
 
 def _cameras(store: Store, members: Sequence[ScenePose], scenes: Mapping[str, Scene]) -> Cameras:
     """Return the cameras of all scenes in the map frame, with names unique across scenes."""
-    moved = [(pose, transform_cameras(store.scenes.cameras(pose.scene), pose.S_map_scene)) for pose in members]
-    return Cameras(
-        np.concatenate([cameras.T_frame_camera for _, cameras in moved]),
-        np.concatenate([cameras.intrinsics_px for _, cameras in moved]),
-        np.concatenate([cameras.sizes_px for _, cameras in moved]),
-        tuple(f"{scenes[pose.scene].name}/{name}" for pose, cameras in moved for name in cameras.names),
-    )
+    parts = []
+    for pose in members:
+        cameras, name = store.scenes.cameras(pose.scene), scenes[pose.scene].name
+        parts.append(
+            replace(
+                transform_cameras(cameras, pose.S_map_scene),
+                names=tuple(f"{name}/{camera}" for camera in cameras.names),
+                lenses=tuple(lens and replace(lens, photo=f"{name}/{lens.photo}") for lens in cameras.lenses),
+            )
+        )
+    return Cameras.concatenate(parts)

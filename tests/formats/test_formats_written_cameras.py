@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats import colmap, nerfstudio, read_cameras
+from gsmap.geometry.camera_models import camera_model, pinhole_views, rays_of
 from gsmap.types import Cameras
 
 
@@ -22,6 +23,24 @@ def some() -> Cameras:
     intrinsics = np.array([[501.25, 499.75, 1 / 3, 238.1]] * 3 + [[350.0, 360, 200.5, 150.5]] * 4)
     sizes = np.array([[640, 480]] * 3 + [[400, 300]] * 4)
     return Cameras(pose, intrinsics, sizes, tuple(f"b/{k}.jpg" if k % 2 else f"a {k}.jpg" for k in range(n)))
+
+
+PINHOLE = (400.0, 410.0, 310.0, 250.0)
+LENSES = {
+    "PINHOLE": PINHOLE,
+    "SIMPLE_RADIAL": (400.0, 310.0, 250.0, -0.1),
+    "OPENCV": (*PINHOLE, -0.1, 0.02, 0.001, -0.002),
+    "FULL_OPENCV": (*PINHOLE, -0.1, 0.02, 0.001, -0.002, 0.003, 0.0, 0.0, 0.0),
+    "OPENCV_FISHEYE": (180.0, 180.0, 320.0, 240.0, 0.02, 0.0, 0.0, 0.0),  # seen by several faces
+    "EQUIRECTANGULAR": (640.0, 320.0),
+}
+
+
+def of_lens(name: str, photo: str) -> Cameras:
+    size = (640, 320) if name == "EQUIRECTANGULAR" else (640, 480)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.3, -2, 1]).as_matrix(), (1, 2, 3)
+    return pinhole_views(camera_model(name, *size, LENSES[name]), pose, photo)
 
 
 def by_name(cameras: Cameras) -> Cameras:
@@ -74,6 +93,40 @@ def test_our_reader_finds_nerfstudios_cameras_where_they_were(tmp_path):
     np.testing.assert_array_equal(back.sizes_px, cameras.sizes_px)
     with raises(NotFoundError, code="folder_not_found"):
         nerfstudio.write(tmp_path / "none" / "transforms.json", cameras)
+
+
+def test_photos_are_written_with_their_lenses(tmp_path):
+    """One image per photo, also of a panorama, whose first face to be seen is not the front."""
+    pycolmap = pytest.importorskip("pycolmap")
+    photos = [of_lens(name, f"{name}.jpg") for name in LENSES]
+    photos[-1] = photos[-1][1:]
+    cameras = Cameras.concatenate(photos)
+    colmap.write(tmp_path / "model", cameras)
+    model = pycolmap.Reconstruction(str(tmp_path / "model"))
+    assert sorted(image.name for image in model.images.values()) == sorted(f"{name}.jpg" for name in LENSES)
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        assert image.name == f"{camera.model_name}.jpg"
+        np.testing.assert_array_equal(camera.params, LENSES[camera.model_name])
+        np.testing.assert_allclose(image.cam_from_world().matrix(), photos[0].T_camera_frame[0, :3], atol=1e-9)
+    with raises(InputError, code="unsupported_output"):
+        nerfstudio.write(tmp_path / "mixed.json", cameras)
+    for name, cameras in zip(LENSES, photos, strict=True):
+        folder = tmp_path / name
+        folder.mkdir()
+        nerfstudio.write(folder / "transforms.json", cameras)
+        (frame,) = json.loads((folder / "transforms.json").read_text())["frames"]
+        assert frame["file_path"] == f"{name}.jpg"
+        np.testing.assert_allclose(np.array(frame["transform_matrix"])[:3, 3], (1, 2, 3))
+        back = read_cameras(folder / "transforms.json")[-len(cameras) :]
+        np.testing.assert_allclose(back.T_frame_camera, cameras.T_frame_camera, atol=1e-9)
+        np.testing.assert_array_equal(back.intrinsics_px, cameras.intrinsics_px)
+        for a, b in zip(back.lenses, cameras.lenses, strict=True):
+            at = np.random.default_rng(0).uniform(100, 300, (9, 2))
+            np.testing.assert_allclose(rays_of(a.model, at), rays_of(b.model, at), atol=1e-9)
+    odd = pinhole_views(camera_model("FOV", 640, 480, (*PINHOLE, 0.1)), np.eye(4), "odd.jpg")
+    with raises(InputError, code="unsupported_output"):
+        nerfstudio.write(tmp_path / "odd.json", odd)
 
 
 def test_nerfstudios_cameras_look_along_minus_z(tmp_path):

@@ -11,13 +11,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from raising import raises
 
 import gsmap.map
+from gsmap.errors import NotFoundError
+from gsmap.formats import read_cameras
 from gsmap.formats.g2o import read_graph
 from gsmap.formats.tum import read_trajectory
+from gsmap.geometry.camera_models import camera_model, pinhole_views
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.map import Map
-from gsmap.types import Gaussians, Sim3
+from gsmap.types import Cameras, Gaussians, Sim3
 
 NAMES = ["walk", "attic", "cellar", "den", "barn"]  # not in the order of names
 SIGMAS = np.array([0.001] * 6 + [1e-9])
@@ -25,9 +29,18 @@ AT = {name: np.array([2.0 * i, 0.5 * i, 0.0]) for i, name in enumerate(NAMES)}
 DAY = datetime(2026, 5, 31, tzinfo=UTC).timestamp()
 
 
+def photos() -> Cameras:
+    """A photo with distortion and a panorama, at -4 m along the view of the Gaussians."""
+    pose = np.eye(4)
+    pose[:3, 3] = (0, 0, -4)
+    bent = camera_model("OPENCV", 200, 150, (180.0, 180, 100, 75, -0.2, 0.05, 0.001, 0))
+    panorama = camera_model("EQUIRECTANGULAR", 200, 100, (200.0, 100.0))
+    return Cameras.concatenate([pinhole_views(bent, pose, "a.jpg"), pinhole_views(panorama, pose, "pano.jpg")])
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five scenes in a row, none of which has a date, in a unit that nobody told."""
+    """Five scenes in a row, none of which has a date, in a unit that nobody told; one has photos."""
     rng = np.random.default_rng(0)
     n = 400
     quats, log_scales = np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 3), -4.0)
@@ -35,7 +48,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("poses") / "site.gsmap"
     with gsmap.map.create(path) as m:
         for name in NAMES:
-            m.ingest(transform_gaussians(one, Sim3(np.eye(3), -AT[name])), name=name, scale="unknown")
+            moved = transform_gaussians(one, Sim3(np.eye(3), -AT[name]))
+            m.ingest(moved, cameras=photos() if name == "den" else None, name=name, scale="unknown")
         for a, b in itertools.pairwise(NAMES):
             m.add_edge(f"{a}:{b}", Sim3(np.eye(3), AT[b] - AT[a]), SIGMAS)
         m.optimize()
@@ -132,8 +146,22 @@ def test_a_g2o_in_metres_has_the_same_error_at_every_pose(m, tmp_path):
     assert names == [f"# {name}" for name in sorted(NAMES)]
 
 
-def test_cameras_stay_in_the_unit_of_exports_which_is_said(m, tmp_path, caplog):
+def test_photos_are_written_with_their_lenses_in_the_unit_of_exports_which_is_said(m, tmp_path, caplog):
     m.edit("attic", metres_per_unit=0.5)
     with caplog.at_level(logging.WARNING, "gsmap.map"):
-        m.write_poses(tmp_path / "transforms.json", "nerfstudio")
+        m.write_poses(tmp_path / "model", "colmap")
     assert any("0.5 m" in text for text in caplog.messages)
+    assert any("barn" in text and "den" not in text for text in caplog.messages), "it has no photos"
+    found = read_cameras(tmp_path / "model")
+    assert {name: found.lenses[rows[0]].model.name for name, rows in found.photo_rows.items()} == {
+        "den/a.jpg": "OPENCV",
+        "den/pano.jpg": "EQUIRECTANGULAR",
+    }
+    den = m.poses()["den"].S_map_scene
+    np.testing.assert_allclose(found.centers, np.tile(den.apply(np.array([[0, 0, -4.0]])), (7, 1)), atol=1e-6)
+
+
+def test_a_map_without_photos_has_no_cameras_to_write(m, tmp_path):
+    m.remove("den")
+    with raises(NotFoundError, code="no_cameras"):
+        m.write_poses(tmp_path / "transforms.json", "nerfstudio")
