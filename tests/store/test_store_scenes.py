@@ -3,13 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from raising import raises
-from sqlalchemy import text
+from sqlalchemy import select, text
 from store_samples import make_cameras, make_gaussians
 
 from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.geometry.camera_models import camera_model, pinhole_views
 from gsmap.geometry.morton import morton_order
-from gsmap.store import Store, scene_content, scene_id, scene_refs
+from gsmap.store import Store, scene_content, scene_id, scene_refs, schema
 from gsmap.store.chunk_boxes import chunk_boxes
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.types import Cameras, Gaussians
@@ -340,3 +340,15 @@ def test_damaged_lenses_are_reported(store, monkeypatch, wrong):
     store.scenes.add(make_gaussians(), with_lenses(), name="a")
     with raises(CorruptError, code="catalog_invalid"):
         store.scenes.cameras("a")
+
+
+def test_a_scene_without_its_chunk_boxes_is_found(store):
+    """Without them a reader of a box would see none of the scene."""
+    for seed in range(2):
+        store.scenes.add(make_gaussians(50, seed=seed), make_cameras(), name=f"scene{seed}")
+    assert store.check().ok
+    with store.catalog.write() as connection:
+        number = connection.execute(select(schema.scenes.c.number).where(schema.scenes.c.name == "scene1")).scalar_one()
+        connection.exec_driver_sql(f"DELETE FROM {schema.CHUNK_BOXES} WHERE s0 = {number}")
+    (problem,) = store.check().problems
+    assert "scene1" in problem
