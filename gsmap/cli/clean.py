@@ -33,9 +33,10 @@ def command(
     from gsmap.ingest.clean import clean
     from gsmap.types.rows.maps import CleanReport
 
-    cleaned = clean(formats.read(source), bbox, where=source)
-    formats.write(target, cleaned.gaussians)
-    say(f"{target}: {cleaned.note}")
+    cleaned, about = clean(formats.read(source), bbox, where=source), formats.info(source)
+    notes = formats.rewrite(target, cleaned.gaussians, about)
+    for note in (f"{target}: {cleaned.note}", *notes):
+        say(note)
     report = CleanReport(
         input=source,
         output=target,

@@ -33,10 +33,11 @@ def command(
     from gsmap.formats.precision import rounded_to
     from gsmap.types.rows.maps import ConvertReport
 
-    gaussians = formats.read(source)
+    gaussians, about = formats.read(source), formats.info(source)
     offset = gaussians.origin if local else np.zeros(3)
-    formats.write(target, replace(gaussians, origin=np.zeros(3)) if local else gaussians)
-    say(f"wrote {len(gaussians)} Gaussians to {target}")
+    notes = formats.rewrite(target, replace(gaussians, origin=np.zeros(3)) if local else gaussians, about)
+    for note in (f"wrote {len(gaussians)} Gaussians to {target}", *notes):
+        say(note)
     step = rounded_to(gaussians) if gaussians.origin.any() else 0.0
     if step:
         say(f"{source} stores positions in single precision, rounded to {step:g} at this distance from the origin")

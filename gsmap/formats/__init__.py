@@ -7,6 +7,7 @@ The contract of a format is in `gsmap.methods.format`; another package adds one 
 from __future__ import annotations
 
 import contextlib
+import inspect
 import os
 import sys
 from collections.abc import Iterator
@@ -147,6 +148,25 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
             write_output(path, lambda staged: module.write(staged, content, **options))
         else:  # staged beside its other files
             write_whole(Path(os.path.realpath(path)), lambda staged: module.write(staged, content, **options))
+
+
+def rewrite(path: str | os.PathLike[str], gaussians: GaussianSource, about: FileInfo) -> tuple[str, ...]:
+    """Write Gaussians that were read from a file, with its metadata as far as the format can store them.
+
+    Args:
+        about: Metadata of the file that was read (`info`).
+
+    Returns:
+        The notes of ``about``, and one on metadata that the format cannot store.
+
+    Raises:
+        NotFoundError, InputError: As `write`.
+    """
+    can_mark = "antialiased" in inspect.signature(_load(_suffix(Path(path), "write")).write).parameters
+    write(path, gaussians, **({"antialiased": True} if about.antialiased and can_mark else {}))
+    if about.antialiased and not can_mark:
+        return (*about.notes, f"{path} does not state that training was antialiased: its format cannot store that")
+    return about.notes
 
 
 def read_cameras(path: str | os.PathLike[str]) -> Cameras:

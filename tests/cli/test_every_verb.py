@@ -453,3 +453,17 @@ def test_python_and_the_command_line_say_the_same(site: Path, cli: Run) -> None:
 def test_a_converted_file_holds_what_the_json_says(cli: Run, captures: Path, tmp_path: Path) -> None:
     said = cli("convert", captures / "left.ply", tmp_path / "left.spz", "--json").json
     assert len(formats.read(tmp_path / "left.spz")) == said["num_gaussians"] > 1000
+
+
+@pytest.mark.parametrize("verb", ["convert", "clean"])
+def test_a_rewritten_file_keeps_its_mark_or_the_loss_is_noted(
+    cli: Run, captures: Path, tmp_path: Path, verb: str
+) -> None:
+    gaussians = formats.read(captures / "left.ply")
+    formats.write(tmp_path / "a.ply", gaussians, antialiased=True, extra={"filter_3D": np.zeros(len(gaussians))})
+    for target, is_noted in (("a.spz", False), ("b.ply", False), ("b.sog", False), ("b.splat", True)):
+        done = cli(verb, tmp_path / "a.ply", tmp_path / target)
+        assert "filter of Mip-Splatting" in done.stderr  # what reading changed
+        assert formats.info(tmp_path / target).antialiased != is_noted
+        assert ("antialias" in done.stderr) == is_noted
+        assert done.stderr.count("\n") == 2 + is_noted
