@@ -171,7 +171,7 @@ def _intrinsics(both: dict[str, Any], path: Path) -> tuple[tuple[float, float, f
             code="incomplete_camera",
         )
     fy = fx if fy is None else fy
-    cx, cy = both.get("cx", width / 2), both.get("cy", height / 2)
+    cx, cy = (size / 2 if both.get(key) is None else both[key] for key, size in (("cx", width), ("cy", height)))
     return (float(fx), float(fy), float(cx), float(cy)), (width, height)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from gsmap.errors import InputError
 from gsmap.formats.camera_files import load_json, unique
 from gsmap.formats.lenses import pinhole_cameras
-from gsmap.geometry.camera_models import camera_model
+from gsmap.geometry.camera_models import EQUIRECTANGULAR, camera_model
 from gsmap.types import Cameras
 from gsmap.types.cameras import CameraModel
 
@@ -84,6 +84,8 @@ def _pose(camera: dict[str, Any]) -> np.ndarray:
 
 def _model(internals: dict[str, Any], size_px: tuple[int, int]) -> CameraModel | str:
     """Return a lens, or the name of one that COLMAP does not have: Pix4D's fisheye polynomial has even powers."""
+    if internals["type"] == "spherical":
+        return camera_model(EQUIRECTANGULAR, *size_px, size_px)
     if internals["type"] != "perspective":
         return f"OPF {internals['type']}"
     f, (cx, cy) = float(internals["focal_length_px"]), map(float, internals["principal_point_px"])

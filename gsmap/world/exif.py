@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsmap.errors import GsmapError, InputError
+from gsmap.errors import GsmapError, InputError, MissingDependencyError
 from gsmap.formats.pictures import open_picture
 from gsmap.world.params import Params
 
@@ -18,7 +18,7 @@ _HEIGHT_FACTOR = 2.0  # satellite heights are less accurate than horizontal posi
 _SEA_LEVEL_SIGMA_M = 40.0  # of the geoid's height above the ellipsoid, an error that a whole map shares
 _CORRECTED_SIGMA_M = 0.5  # receivers with corrections report less, including their common error
 _RTK = re.compile(rb"drone-dji:Rtk(Flag|StdLat|StdLon|StdHgt)(?:=[\"']|>)\s*([-+0-9.eE]+)")
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif")
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,7 @@ def read_folder(folder: str | os.PathLike[str]) -> dict[str, PhotoPosition | Non
 
     Raises:
         InputError: the folder does not exist, or no photo in it has a position.
+        MissingDependencyError: a HEIC photo, and pillow-heif is not installed.
     """
     folder = Path(os.path.abspath(folder))  # absolute, because the name of a folder may name a scene
     if not folder.is_dir():
@@ -69,11 +70,17 @@ def read_folder(folder: str | os.PathLike[str]) -> dict[str, PhotoPosition | Non
 
 
 def read(path: str | os.PathLike[str]) -> PhotoPosition | None:
-    """Read the position of a photo; return None if EXIF has no position or an invalid one."""
+    """Read the position of a photo; return None if EXIF has no position or an invalid one.
+
+    Raises:
+        MissingDependencyError: a HEIC photo, and pillow-heif is not installed.
+    """
     try:
         with open_picture(path) as picture:
             gps = picture.getexif().get_ifd(_GPS)
             rtk = _rtk_sigmas(picture.info.get("xmp") or picture.info.get("XML:com.adobe.xmp") or b"")
+    except MissingDependencyError:
+        raise
     except GsmapError:
         return None
     datum = str(gps.get(_DATUM, "WGS-84")).strip("\0 ").upper().replace(" ", "").replace("-", "")

@@ -132,7 +132,8 @@ def test_blender_angle_and_image_size(tmp_path):
 
     Image.new("RGB", (80, 60)).save(tmp_path / "r_0.png")
     frames = [{"file_path": "./r_0", "transform_matrix": np.eye(4).tolist()}]
-    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": np.pi / 2, "frames": frames}))
+    content = {"camera_angle_x": np.pi / 2, "cx": None, "cy": None, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
     cameras = read_cameras(tmp_path)
     assert cameras.sizes_px[0].tolist() == [80, 60]
     np.testing.assert_allclose(cameras.intrinsics_px[0], [40, 40, 40, 30])

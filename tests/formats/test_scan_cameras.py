@@ -168,6 +168,13 @@ def test_opf(tmp_path: Path) -> None:
     np.testing.assert_allclose(pixels(cameras), np.c_[u, v] * 510 + [322.0, 238.5], atol=1e-6)
 
 
+def test_a_panorama_of_opf_faces_along_the_axes_of_its_camera(tmp_path: Path) -> None:
+    cameras = read_cameras(opf(tmp_path, {"type": "spherical", "principal_point_px": [320.0, 240.0]}))
+    assert len(cameras) == 6
+    assert cameras.names[0] == "DJI_1.jpg#front"
+    np.testing.assert_allclose(cameras.T_frame_camera[0], POSE, atol=1e-9)
+
+
 def test_opf_names_nothing_outside_its_folder(tmp_path: Path) -> None:
     (tmp_path / "project").mkdir()
     for uri in ("../calibrated.json", "file:///etc/passwd", "/etc/passwd"):

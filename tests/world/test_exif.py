@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
 from PIL import Image
 from raising import raises
 
-from gsmap.errors import ConfigError, InputError
+from gsmap.errors import ConfigError, InputError, MissingDependencyError
 from gsmap.world import Params, exif
 
 
@@ -106,6 +107,19 @@ def test_sigmas_are_positive(name: str) -> None:
 )
 def test_what_is_no_position_is_none(tmp_path: Path, gps: dict[str, object]) -> None:
     assert exif.read(photo(tmp_path / "a.jpg", **gps)) is None
+
+
+def test_heic_photos_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The suffix counts only for the search; the content is read whatever it is."""
+    tags = {"t1": "N", "t2": (48.0, 0.0, 0.0), "t3": "E", "t4": (11.0, 0.0, 0.0)}
+    for suffix in (".HEIC", ".heif"):
+        photo(tmp_path / "a.jpg", **tags).rename(tmp_path / f"a{suffix}")
+    assert all(found is not None for found in exif.read_folder(tmp_path).values())
+    assert len(exif.read_folder(tmp_path)) == 2
+    (tmp_path / "a.heif").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(64))
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(MissingDependencyError):
+        exif.read_folder(tmp_path)
 
 
 def test_a_folder_without_positions_is_refused(tmp_path: Path) -> None:
