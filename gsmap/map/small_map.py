@@ -127,8 +127,8 @@ def export_small(
         )
     localizer = Localizer(store, settings, progress)
     scenes = sorted(localizer.placed)
-    passing = {} if known is None else find_dynamic_content(store, settings, known)
-    standing = standing_comparisons(store, settings) if known is None else []
+    standing = standing_comparisons(store, settings)
+    passing = {} if known is None else find_dynamic_content(store, known, standing)
     wanted: dict[str, int] = {}
     shown: dict[str, int] = {}
     for number, scene in enumerate(scenes):

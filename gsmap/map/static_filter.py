@@ -5,7 +5,7 @@ A thing persists as far as it was looked for: one that was seen in every look is
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -16,12 +16,12 @@ import numpy as np
 from gsmap.errors import NotFoundError
 from gsmap.methods import text_digest
 from gsmap.store import Store
+from gsmap.store.change_rows import Comparison
 from gsmap.types import MapObject
 from gsmap.types.plain import canonical
 
 if TYPE_CHECKING:
     from gsmap.map.objects import MapObjects
-    from gsmap.map.settings import Settings
 
 _OF_THINGS = ("appeared", "disappeared", "moved", "replaced")
 """Kinds of changes that concern objects; recoloured surfaces and other lighting are static content."""
@@ -71,10 +71,12 @@ def _shared(a: np.ndarray, b: np.ndarray) -> float:
     return float(both / min((a[1] - a[0]).prod(), (b[1] - b[0]).prod()))
 
 
-def find_dynamic_content(store: Store, settings: Settings, known: MapObjects) -> dict[str, DynamicContent]:
-    """Return the dynamic content of each placed scene, by scene id, reading only the catalog."""
-    from gsmap.map.stages.change import standing_comparisons
+def find_dynamic_content(store: Store, known: MapObjects, standing: Sequence[Comparison]) -> dict[str, DynamicContent]:
+    """Return the dynamic content of each placed scene, by scene id, reading only the catalog.
 
+    Args:
+        standing: the comparisons that hold (`gsmap.map.stages.change.standing_comparisons`).
+    """
     graphs = {graph.scene: graph.key for graph in store.graphs.list()}
     things: dict[str, set[int]] = {}
     for thing in (*known.objects, *known.building):  # what could not be split may have moved, too
@@ -84,7 +86,7 @@ def find_dynamic_content(store: Store, settings: Settings, known: MapObjects) ->
                     things.setdefault(sighting.scene, set()).add(sighting.thing)
     changes: dict[str, list[tuple[int, int, str]]] = {}
     told: dict[str, list[str]] = {}
-    for one in standing_comparisons(store, settings):
+    for one in standing:
         for change in one.changes:
             if change.status == "rejected" or change.kind not in _OF_THINGS:
                 continue

@@ -27,6 +27,7 @@ from gsmap.map.jobs import TileMaker
 from gsmap.map.metric_scales import map_metres, metre_notes
 from gsmap.map.settings import Settings
 from gsmap.map.shared_jobs import note_interruption
+from gsmap.map.stages.change import standing_comparisons
 from gsmap.map.static_filter import DynamicContent, dynamic_notes, find_dynamic_content
 from gsmap.map.world import GeoreferencedComponent, georeferenced_components, world_notes
 from gsmap.merge import photos_m, reach_m, recipe_key, uses_dates, with_prefer, with_steps
@@ -175,7 +176,8 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
         from gsmap.map.objects import load_objects
 
         known = load_objects(store, settings) if known is None else known
-        passing = {scene: one for scene, one in find_dynamic_content(store, settings, known).items() if scene in scenes}
+        found = find_dynamic_content(store, known, standing_comparisons(store, settings))
+        passing = {scene: one for scene, one in found.items() if scene in scenes}
         recipe = replace(recipe, without={scene: one.digest for scene, one in passing.items() if one.digest})
         notes += tuple(dynamic_notes(known, passing))
     exported = {pose.component for pose in placed.values()}
