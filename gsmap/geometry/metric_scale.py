@@ -53,8 +53,8 @@ def estimate_metric_scale(
     Args:
         scenes: all scenes of the component, with their poses in it.
         surveyed: metres per unit of the frame and the standard deviation of the logarithm, from control points,
-            positions or scale bars. It takes precedence over everything else unless the standard deviation exceeds
-            ``_SURVEYED_SIGMA``.
+            positions or scale bars. It takes precedence over everything else; if the standard deviation exceeds
+            ``_SURVEYED_SIGMA``, only over assumptions and estimates that are less precise.
     """
     if surveyed is not None and surveyed[1] <= _SURVEYED_SIGMA:
         return _rounded(*surveyed)
@@ -64,6 +64,12 @@ def estimate_metric_scale(
     measured = [(1.0, pose) for unit, pose in scenes if unit.in_metres]
     if measured:
         return _combined(measured, _MEASURED_SIGMA, "measured")
+    estimate = _estimated(scenes)
+    return _rounded(*surveyed) if surveyed is not None and surveyed[1] < estimate.sigma else estimate
+
+
+def _estimated(scenes: Sequence[tuple[SceneUnit, ScenePose]]) -> MetricScale:
+    """Estimate the metric scale of a component of which nobody specified or measured a length."""
     guesses = [np.log(unit.guess_m / pose.S_map_scene.scale) for unit, pose in scenes if unit.guess_m is not None]
     guess = float(np.exp(np.median(guesses))) if guesses else None
     metric = _majority([pose for unit, pose in scenes if unit.may_be_metres])

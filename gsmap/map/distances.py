@@ -151,11 +151,10 @@ def _where(store: Store, one: SpecifiedPoint, graph: PoseGraph, component: int |
 
 def _metre(store: Store, graph: PoseGraph, component: int, tie: Georeference | None) -> tuple[float, float, str]:
     """Return metres per unit of a component, the standard deviation of its logarithm, and how it is known."""
-    if tie is not None and tie.metres_per_unit is not None:
-        return tie.metres_per_unit, tie.scale_sigma, "world" if tie.S_world_map is not None else "measured"
     metre = map_metres(store, graph)[component]
-    sigma = metre.sigma if np.isfinite(metre.sigma) else float("inf")
-    return metre.metres_per_unit, sigma, metre.known_by
+    if metre.known_by == "surveyed" and tie is not None and tie.metres_per_unit is not None:  # without rounding
+        return tie.metres_per_unit, tie.scale_sigma, "world" if tie.S_world_map is not None else "measured"
+    return metre.metres_per_unit, metre.sigma, metre.known_by
 
 
 def _apart(a: np.ndarray | None, b: np.ndarray | None) -> float:

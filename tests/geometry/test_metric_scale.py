@@ -94,6 +94,22 @@ def test_a_guess_says_how_little_it_is_and_does_not_follow_every_capture():
     assert estimate_metric_scale([*scenes, (SceneUnit(guess_m=0.3), pose())]).metres_per_unit == found.metres_per_unit
 
 
+@pytest.mark.parametrize(
+    ("unit", "sigma", "known_by"),
+    [
+        (SceneUnit(specified=1.0), 0.01, "surveyed"),
+        (SceneUnit(specified=1.0), 0.1, "told"),
+        (KNOWN, 0.1, "measured"),
+        (SceneUnit(may_be_metres=True), 0.1, "assumed"),
+        (SceneUnit(guess_m=0.3), 0.1, "surveyed"),
+        (SceneUnit(guess_m=0.3), 1.0, "guessed"),
+        (UNKNOWN, 0.1, "surveyed"),
+    ],
+)
+def test_a_survey_is_taken_where_nothing_better_is_known(unit, sigma, known_by):
+    assert estimate_metric_scale([(unit, pose())], (2.0, sigma)).known_by == known_by
+
+
 def test_where_nothing_tells_one_is_taken_and_said_to_be():
     found = estimate_metric_scale([(UNKNOWN, pose())])
     assert (found.metres_per_unit, found.known_by, found.is_known) == (1.0, "unknown", False)

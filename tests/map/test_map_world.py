@@ -116,6 +116,16 @@ def test_measuring(tied: Path, site: Site) -> None:
             m.measure("site-000:site-000_0.jpg@5000,2", "0,0,0")
 
 
+def test_a_rough_scale_bar_does_not_outweigh_a_length_that_was_specified(site: Site, tmp_path: Path) -> None:
+    with made_map(tmp_path / "site.gsmap", site) as m:
+        m.edit("site-000", metres_per_unit=1.0)
+        bar = ("site-000:0,0,0", "site-000:1,0,0", 1.3)
+        m.georeference(Request(bars=[bar], bar_sigma_m=0.2))
+        assert m.metres()[0].known_by == "told"
+        found = m.measure("site-000:0,0,0", "site-000:2,0,0")
+        assert (found.distance_m, found.known_by) == (pytest.approx(2.0, rel=0.01), "told")
+
+
 def test_observations_live_through_branch_backup_clone_and_merge(tied: Path, site: Site, tmp_path: Path) -> None:
     before = world_of(tied)
     with gsmap.map.open(tied) as m:
