@@ -53,9 +53,13 @@ class Priors:
             rows = [row for row in connection.execute(query) if row.scene in living]
         return tuple((row.number, _prior(row)) for row in rows)
 
-    def of(self, scene: str) -> Prior | None:
-        """Return the current prior of a scene (id); None without a prior."""
-        query = select(priors).where(priors.c.scene == scene, priors.c.removed_at.is_(None)).order_by(priors.c.number)
+    def of(self, scene: str, at: str | None = None) -> Prior | None:
+        """Return the current prior of a scene (id), or the prior at a time; None without a prior."""
+        query = select(priors).where(priors.c.scene == scene).order_by(priors.c.number)
+        if at is None:
+            query = query.where(priors.c.removed_at.is_(None))
+        else:
+            query = query.where(priors.c.created_at <= at, priors.c.removed_at.is_(None) | (priors.c.removed_at > at))
         with self._catalog.read() as connection:
             rows = connection.execute(query).all()
         return _prior(rows[-1]) if rows else None

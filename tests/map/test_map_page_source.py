@@ -374,6 +374,22 @@ def test_a_prior_is_answered_without_settings(site: Map) -> None:
     assert math.isinf(row.sigmas[0])
 
 
+def test_a_prior_is_used_once_it_was_solved(site: Map, tried: list[tuple[str, str]]) -> None:
+    from gsmap.types import Prior
+
+    def outcome(x: float) -> str:
+        row = site.set_prior(Prior("hall", Sim3(np.eye(3), np.array([x, 0, 0])), np.full(7, 0.1)))
+        assert row is not None
+        return row.outcome
+
+    site.update()
+    assert outcome(2.0) == "not solved yet"
+    site.optimize()
+    assert site.show_scene("hall").prior.outcome == "used"
+    assert outcome(5.0) == "not solved yet"
+    assert outcome(2.0) == "used", "the poses were solved with it"
+
+
 @pytest.mark.parametrize(
     ("name", "kind"),
     [

@@ -14,6 +14,7 @@ from gsmap.methods import RecipeKey
 from gsmap.store import Store
 from gsmap.types import Scene, SceneGraph, ScenePose
 from gsmap.types.metric_scale import MetricScale
+from gsmap.types.plain import canonical
 from gsmap.types.rows.scenes import FactRow, GraphRow, LayerRow, NodeRow, PriorRow, SceneEdgeRow, SceneReport
 
 
@@ -89,7 +90,9 @@ def prior_row(store: Store, scene: Scene) -> PriorRow | None:
     prior, newest = store.priors.of(scene.id), store.revisions.newest()
     if prior is None:
         return None
-    outweighed = newest is not None and scene.id in newest.provenance.contradicted_priors
+    outcome = "not solved yet"
+    if newest is not None and canonical(store.priors.of(scene.id, newest.created_at)) == canonical(prior):
+        outcome = "outweighed by the edges" if scene.id in newest.provenance.contradicted_priors else "used"
     return PriorRow(
         scene=scene.id,
         scene_name=scene.name,
@@ -97,7 +100,7 @@ def prior_row(store: Store, scene: Scene) -> PriorRow | None:
         sigmas=prior.sigmas,
         up=prior.up,
         up_sigma_rad=prior.up_sigma_rad,
-        outcome="not solved yet" if newest is None else "outweighed by the edges" if outweighed else "used",
+        outcome=outcome,
     )
 
 
