@@ -163,9 +163,19 @@ def change_detail(store: Store, number: int) -> ChangeDetail:
 
 
 def num_open(store: Store, settings: Settings) -> int:
-    """Count the unreviewed changes above the minimum confidence."""
-    found = [change.confidence for one in store.changes.current() for change in one.changes if change.status == "open"]
-    return sum(confidence >= settings.change.min_confidence for confidence in found)
+    """Count the unreviewed changes above the minimum confidence in the pairs that ``gsmap changes`` compares."""
+    found = [
+        (one.older, one.newer)
+        for one in store.changes.current()
+        for change in one.changes
+        if change.status == "open" and change.confidence >= settings.change.min_confidence
+    ]
+    if not found or store.revisions.newest_number() is None:
+        return 0
+    from gsmap.map.stages.change import plan_comparisons
+
+    pairs = set(plan_comparisons(store, settings).pairs)
+    return sum(pair in pairs for pair in found)
 
 
 def _find(store: Store, number: int) -> tuple[Comparison, StoredChange]:

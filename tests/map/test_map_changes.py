@@ -232,6 +232,13 @@ def test_words_on_changes(site: Map, seen: Seen) -> None:
         site.confirm("c9")
 
 
+def test_status_counts_the_open_changes_that_are_listed(site: Map, seen: Seen) -> None:
+    site.changes()
+    site.edit("june", captured_at="none")
+    listed = [row for row in site.changes().changes if row.confidence >= site.settings.change.min_confidence]
+    assert {row.what: row.count for row in site.status().todo}["changes"] == len(listed) == 1
+
+
 def test_a_map_that_cannot_be_written_tells_what_it_knows(
     site: Map, seen: Seen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
