@@ -283,10 +283,9 @@ class MapPageSource:
     def _known(self) -> MapObjects:
         """Return the annotated objects of the map, cached for one state of the catalog."""
         with self._objects_lock:
-            signature = self._store.catalog.signature()
+            signature = self._store.catalog.signature()  # before reading, as other processes may write meanwhile
             if self._objects is None or signature is None or self._objects[0] != signature:
-                known = compute_objects(self._store, self._settings, lambda stage, fraction, text: None)
-                self._objects = self._store.catalog.signature(), known
+                self._objects = signature, compute_objects(self._store, self._settings, lambda *_: None)
             return self._objects[1]
 
     def _places(self) -> dict[str, int]:
@@ -335,7 +334,7 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
         has_objects=placed is not None and bool(graphs),
         stale=bool(given.scenes) and (newest is None or newest.key != given.key.digest),
     )
-    return replace(found, state=text_digest(canonical(found))[:24])
+    return replace(found, state=text_digest(canonical([found, store.objects.facts()]))[:24])
 
 
 def prior_words(prior: Prior, metres_per_unit: float) -> str:
@@ -401,6 +400,7 @@ def _edges(store: Store, placed: PoseGraph | None) -> list[ViewEdge]:
                 overlap=row.overlap,
                 num_inliers=row.num_inliers,
                 doubt=EdgeEntry(row, chi2=chi2, probability=known).doubt,
+                registration=None if stored is None else stored.number,
             )
         )
     return out

@@ -65,6 +65,7 @@ class ViewEdge:
         overlap: Overlap of the scenes, in [0, 1].
         num_inliers: Number of inliers.
         doubt: Urgency of a review, in [0, 1].
+        registration: Number of its current registration; None if it has none.
     """
 
     target: str
@@ -80,6 +81,7 @@ class ViewEdge:
     overlap: float = 0.0
     num_inliers: int = 0
     doubt: float = 0.0
+    registration: int | None = None
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from gsmap.errors import ConfigError, DiskFullError, InputError, NotFoundError, 
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import Map
-from gsmap.map.objects import _numbered, load_objects
+from gsmap.map.objects import _numbered, compute_objects, load_objects
 from gsmap.map.page_source import MapPageSource
 from gsmap.map.small_map import SmallLocalizer
 from gsmap.map.stages.change import standing_comparisons
@@ -387,6 +387,27 @@ def test_people_name_things_and_find_them_by_name(site: Map) -> None:
     site.edit_object("wardrobe", name="none", label="none")
     assert site.history(cupboard.id).objects[0].name is None
     assert site.history(cupboard.id).objects[0].note == "oak"
+
+
+def test_the_page_shows_a_label_that_was_written_while_objects_were_read(
+    site: Map, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page, number = MapPageSource(site.store, site.settings), int(site.objects().objects[0].id[1:])
+    before, read = page.state(), compute_objects
+
+    def write_after_reading(*args: object) -> object:
+        found = read(*args)
+        monkeypatch.setattr("gsmap.map.page_source.compute_objects", read)
+        site.store.objects.edit(number, label="meanwhile")
+        return found
+
+    monkeypatch.setattr("gsmap.map.page_source.compute_objects", write_after_reading)
+    try:
+        page.graph()
+        assert {row["id"]: row["label"] for row in page.graph()["objects"]}[f"o{number}"] == "meanwhile"
+        assert page.state() != before
+    finally:
+        site.store.objects.edit(number, label="")
 
 
 def test_two_that_a_person_says_are_one_are_told_as_one_until_that_is_taken_back(site: Map) -> None:

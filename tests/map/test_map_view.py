@@ -197,6 +197,16 @@ def test_what_others_do_meanwhile_is_seen_with_the_next_request(folder):
         assert page.ask(first["edges"][0]["detail"])[0] == 404
 
 
+def test_a_measurement_that_replaces_another_is_another_state(folder):
+    with gsmap.open(folder) as m:
+        page = MapPageSource(m.store, m.settings)
+        states = []
+        for x in (3.0, 4.0):
+            m.add_edge("hall:yard", Sim3(np.eye(3), np.array([x, 0, 0])), np.full(7, 0.01), "by tape")
+            states.append(page.state())
+        assert states[0] != states[1]
+
+
 def test_nothing_is_changed_where_a_map_is_only_looked_at(folder):
     with gsmap.open(folder) as m:
         with m.view(read_only=True).start() as server:
