@@ -484,6 +484,23 @@ def test_static_leaves_out_what_came_and_went_and_keeps_the_rest(site: Map, tmp_
     )
 
 
+def test_a_static_export_is_out_of_date_where_the_objects_are(site: Map, tmp_path: Path) -> None:
+    def dirty() -> list[int]:
+        return [row.count for row in site.status().todo if row.what == "dirty_tiles" and str(tmp_path) in row.verb]
+
+    exported(site, tmp_path, static=True)
+    assert dirty() == []
+    placed = site.store.revisions.get()
+    assert placed is not None
+    may = placed.poses[site.store.scenes.get("may").id]
+    moved = replace(may, S_map_scene=Sim3(np.eye(3), np.array([0.5, 0, 0])) @ may.S_map_scene)
+    site.store.revisions.save(PoseGraph({**placed.poses, may.scene: moved}))
+    try:
+        assert dirty() == [1]
+    finally:
+        site.store.revisions.save(placed)
+
+
 @pytest.mark.parametrize(
     ("states", "shift", "passed"),
     [

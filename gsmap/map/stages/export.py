@@ -438,8 +438,9 @@ def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Reques
     """Return, for each export folder, the number of tiles that a repeated export would make or remove, and the row of
     the last export.
 
-    Read from the catalog alone, which does not say which tiles are empty: new ones are not counted. A folder whose
-    export named a revision stays as it is, whatever the map does.
+    Read from the catalog alone, which does not say which tiles are empty: new ones are not counted. All tiles of static
+    content count if the map's objects are out of date. A folder whose export named a revision stays as it is, whatever
+    the map does.
     """
     newest = {export.target: export for export in store.exports.list()}
     found: dict[str, tuple[int, Request]] = {}
@@ -447,11 +448,13 @@ def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Reques
     for target in store.exports.targets():
         stored = newest[target].settings
         request = Request(**{key: value for key, value in stored.items() if key in known})
+        old = {(tile.component, Path(tile.path).name.partition(".")[0]): tile for tile in store.exports.tiles(target)}
         try:
             planned = plan(store, request, settings)
-        except GsmapError:
-            continue  # what was exported then cannot be now: its verb will say why
-        old = {(tile.component, Path(tile.path).name.partition(".")[0]): tile for tile in store.exports.tiles(target)}
+        except GsmapError as error:  # what was exported then cannot be now: its verb will say why
+            if error.code == "objects_outdated" and old:
+                found[target] = len(old), request
+            continue
         again = [
             tile
             for tile in planned.tiles
