@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import OrderedDict
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +17,8 @@ from gsmap.types import ObjectObservation
 from gsmap.view.change_picture import draw_place
 from gsmap.view.object_picture import SegmentedViews
 
+_MOST_SCENES = 64  # of 3 MB of labels each
+
 
 class ObjectPictures:
     """A renderer of the objects of a map, which keeps the scene that it read last. Thread-safe."""
@@ -24,7 +27,7 @@ class ObjectPictures:
         self._store, self._known = store, known
         self._lock = threading.Lock()
         self._counts: dict[str, np.ndarray] = {}  # samples of each segment of a scene
-        self._shown: dict[str, Sequence[np.ndarray]] = {}
+        self._shown: OrderedDict[str, Sequence[np.ndarray]] = OrderedDict()  # of the scenes drawn last
         self._read: tuple[str, SegmentedViews] | None = None
 
     def draw(self, ref: str, side_px: int = 400) -> np.ndarray:
@@ -59,6 +62,9 @@ class ObjectPictures:
             if best.thing >= 0 and views.scene.cameras is not None:
                 drawn = views.draw(best.thing, side_px)
                 self._shown[best.scene] = views.shown
+                self._shown.move_to_end(best.scene)
+                while len(self._shown) > _MOST_SCENES:
+                    self._shown.popitem(last=False)
             return draw_place(views.scene, best.box * metres, side_px) if drawn is None else drawn
 
     def _num_samples(self, sighting: ObjectObservation) -> int:

@@ -25,7 +25,6 @@ from gsmap.optimize.survey_report import (
     active_observations,
     build_world_tie,
     tie_by_bars,
-    variance_factor,
 )
 from gsmap.optimize.survey_system import Component, System
 from gsmap.optimize.survey_terms import SurveyTerms
@@ -83,23 +82,24 @@ def tie_component(
 def _surveyed(
     system: System, whole: Component, poses: Similarities, survey: Survey, index: int, marginal_scenes: int
 ) -> ComponentSolution:
-    system, found, widened = _with_honest_points(system, survey)
+    system, found, scatter, note = _with_honest_points(system, survey)
     if isinstance(found, SurveyFailure):
         return ComponentSolution(poses, None, tie_by_bars(system, index, survey, found))
     x, factor = found.x, found.factor
     tie = build_world_tie(system, found, index, survey.frame)
-    if widened:
-        tie = replace(tie, notes=(widened, *tie.notes))
+    if note:
+        tie = replace(tie, notes=(note, *tie.notes), point_scatter=scatter)
     covariances = factor.scene_covariances() if len(whole.scenes) <= marginal_scenes else None
     return ComponentSolution(poses.replaced(whole.scenes, x.scenes), covariances, tie)
 
 
-def _with_honest_points(system: System, survey: Survey) -> tuple[System, Solution | SurveyFailure, str]:
+def _with_honest_points(system: System, survey: Survey) -> tuple[System, Solution | SurveyFailure, float, str]:
     """Solve; where control points are left out that larger standard deviations of all explain about as well as
     blunders, solve again with these, because those that were left out may be right and the others wrong.
 
     Returns:
-        The system with the standard deviations that were used, its solution, and a note if they were enlarged.
+        The system with the standard deviations that were used, its solution, the factor by which these are larger than
+        stated, and a note if they are.
     """
     found, times, note = solve_groups(system, survey.frame), 1.0, ""
     for _ in range(_MAX_WIDENINGS):
@@ -110,13 +110,18 @@ def _with_honest_points(system: System, survey: Survey) -> tuple[System, Solutio
             f"control points scatter beyond their stated standard deviations, so these were taken to be {times:.2g} "
             f"times as large (--sigma states them)"
         )
-        sigmas = {p.name: (times * p.sigma_m[0], times * p.sigma_m[1]) for p in survey.points}
-        wider = replace(survey, points=tuple(replace(p, sigma_m=sigmas[p.name]) for p in survey.points))
-        system = System(system.own, SurveyTerms.of(wider, system.terms.scene_ids, system.own.dim), system.scenes)
+        terms = SurveyTerms.of(_widened(survey, times), system.terms.scene_ids, system.own.dim)
+        system = System(system.own, terms, system.scenes)
         found = solve_groups(system, survey.frame)
     if note and isinstance(found, SurveyFailure):
         found = replace(found, problem=f"{note}; {found.problem}")
-    return system, found, note
+    return system, found, times, note
+
+
+def _widened(survey: Survey, times: float) -> Survey:
+    """Multiply the stated standard deviations of control points."""
+    sigmas = {p.name: (times * p.sigma_m[0], times * p.sigma_m[1]) for p in survey.points}
+    return replace(survey, points=tuple(replace(p, sigma_m=sigmas[p.name]) for p in survey.points))
 
 
 def _scatter(system: System, found: Solution) -> float:
@@ -178,7 +183,8 @@ def joint_of_answer(
     held = anchor_directions(m, poses, rows, anchor, terms)
     tie = answer.tie(component)
     tied = tie is not None and tie.S_world_map is not None
-    own = SurveyTerms.of(survey if tied else Survey(), m.scene_ids, m.dim)
+    given = _widened(survey, tie.point_scatter) if tied and tie is not None else Survey()
+    own = SurveyTerms.of(given, m.scene_ids, m.dim)
     system = System(Component(rows, m, terms, anchor, held), own, poses)
     x = own.start(poses, tie.S_world_map if tie is not None and tie.S_world_map is not None else Sim3.identity())
     row = {scene: k for k, scene in enumerate(ids)}
@@ -190,6 +196,7 @@ def joint_of_answer(
     active = active_observations(system, tie)
     weights = system.as_weights(active)
     x = system.fit(replace(x, points=system.points_at(x, active)), weights, hold=True)
-    factor = system.factor(x, weights)
-    # As in the tie: what scatters beyond its stated errors makes the whole solution less certain.
-    return factor.joint(wanted) * variance_factor(system, x, active, system.tests(x, active, factor))
+    joint = system.factor(x, weights).joint(wanted)
+    root = np.ones(len(joint))
+    root[:7] = np.sqrt(tie.variance_factor)  # as in the tie
+    return joint * root * root[:, None]

@@ -94,6 +94,7 @@ def build_world_tie(system: System, solved: Solution, index: int, frame: WorldFr
         tuple(rows),
         notes=tuple(notes),
         contradictions=solved.contradictions,
+        variance_factor=factor_of,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,8 @@ from gsmap.render.image_loss import KnownLoss, image_loss
 from gsmap.render.outputs import image_size
 from gsmap.render.view_step import ViewStep
 from gsmap.types import Cameras, Gaussians
+
+_RARE, _MOST_SIZES = 2, 8  # uses of a size of pictures before it is recorded, and number of sizes that are
 
 
 class GsplatFitter(Fitter):
@@ -70,6 +73,7 @@ class GsplatFitter(Fitter):
         # Gaussians that cannot be drawn do not change; in their place something that no pixel shows is drawn.
         self._hidden = hidden if bool(hidden.any()) else None
         self._view_steps: dict[tuple[object, ...], ViewStep] = {}
+        self._uses: Counter[tuple[object, ...]] = Counter()
         self.reset_statistics()
 
     def reset_statistics(self) -> None:
@@ -102,9 +106,12 @@ class GsplatFitter(Fitter):
             self._rates.copy_(adam.rates_on(self.learning_rates, torch.device("cpu")), non_blocking=True)
             self._sent = self.learning_rates
         views = self._seen_from(cameras)
-        if count > 1 or options.statistics:
-            return self._step_packed(views, targets, weights)
         kind = (width, height, targets.dtype, None if weights is None else weights.dtype)
+        self._uses[kind] += 1
+        # A recorded size keeps memory, so sizes that are rare, and more than a few sizes, are not recorded.
+        known = kind in self._view_steps or (self._uses[kind] > _RARE and len(self._view_steps) < _MOST_SIZES)
+        if count > 1 or options.statistics or not known:
+            return self._step_packed(views, targets, weights)
         if kind not in self._view_steps:
             background = self._background if any(options.background) else None
             loss = (options.ssim_weight, options.huber_delta)
@@ -114,7 +121,7 @@ class GsplatFitter(Fitter):
     def _step_packed(
         self, views: gsplat.DeviceViews, targets: torch.Tensor, weights: torch.Tensor | None
     ) -> torch.Tensor:
-        """Take a step on several views at once, or with statistics."""
+        """Take a step on several views at once, with statistics, or on a view of a rare size."""
         options = self.options
         drawn = self._drawn()
         colour, alpha, _, lists = gsplat.rasterize(drawn, views, depth=False)

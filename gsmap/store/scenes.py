@@ -61,7 +61,7 @@ class SceneSummary(NamedTuple):  # created for all scenes several times per upda
 
 
 class Scenes:
-    """The scenes of a map. A *reference* is a scene's name, its id, or a unique prefix of its id.
+    """The scenes of a map. A *reference* is a scene's id, its name, or a unique prefix of its id of 6 digits and more.
 
     Names are unique among living scenes, not empty, and have no control characters. A name may contain a colon: parsers
     of ``A:B`` must try every colon as the separator.

@@ -28,6 +28,8 @@ def world_tie_to_json(tie: Georeference) -> dict[str, Any]:
         "notes": list(tie.notes),
         "problem_code": tie.problem_code,
         "contradictions": [plain(one) for one in tie.contradictions],
+        "point_scatter": tie.point_scatter,
+        "variance_factor": tie.variance_factor,
     }
 
 
@@ -74,6 +76,8 @@ def _tie(value: dict[str, Any]) -> Georeference:
         # missing in ties of earlier releases
         str(value.get("problem_code", "undetermined" if value["problem"] else "")),
         tuple(_contradiction(one) for one in value.get("contradictions", [])),
+        float(value.get("point_scatter", 1.0)),
+        float(value.get("variance_factor", 1.0)),
     )
 
 

@@ -317,6 +317,8 @@ class Georeference:
             each other and none is to be preferred), ``unsolved`` (no finite solution), or empty where there is no
             problem.
         contradictions: groups of observations that contradict each other.
+        point_scatter: factor by which the stated standard deviations of control points were multiplied.
+        variance_factor: factor by which ``covariance`` was multiplied, because observations scatter.
     """
 
     component: int
@@ -330,6 +332,8 @@ class Georeference:
     notes: tuple[str, ...] = ()
     problem_code: str = ""
     contradictions: tuple[Contradiction, ...] = ()
+    point_scatter: float = 1.0
+    variance_factor: float = 1.0
 
     def __post_init__(self) -> None:
         if self.problem_code not in PROBLEMS:

@@ -77,6 +77,18 @@ def test_of_many_points_an_even_share_is_taken(tmp_path: Path, monkeypatch: pyte
     assert "250 of its 1,000" in found.notes[0]
 
 
+@pytest.mark.parametrize("columns", [[0, 1, 2, 3, 4, 5, 6], [0, 1, 2, 6, 3, 4, 5]])
+def test_of_four_columns_of_bytes_the_three_that_are_alike_are_the_colour(tmp_path: Path, columns: list[int]) -> None:
+    """Colour and a class, as CloudCompare writes them; an intensity and the colour, as scanners do."""
+    rng = np.random.default_rng(0)
+    grey = rng.integers(20, 230, (200, 1))
+    colour = grey + rng.integers(-20, 20, (200, 3))
+    rows = np.c_[rng.normal(size=(200, 3)), colour, rng.integers(0, 9, 200)][:, columns]
+    np.savetxt(tmp_path / "a.xyz", rows, fmt="%.9g")
+    found = scans.read(tmp_path / "a.xyz")
+    np.testing.assert_allclose(found.colours, colour / 255, atol=1e-6)
+
+
 def test_a_ply_that_promises_more_than_it_holds(tmp_path: Path) -> None:
     path = write_ply(tmp_path / "a.ply", *cloud())
     path.write_bytes(path.read_bytes()[:-40])

@@ -358,6 +358,7 @@ def test_a_map_in_a_system_without_a_way_to_the_globe_is_exported(tied: Path, tm
     monkeypatch.setattr(gsmap.world.frame, "T_ecef_frame", nowhere)
     with gsmap.map.open(tied) as m:
         m.export(tmp_path / "plain", tile_size_m=0, format="ply", merge="union")
+        m.export(tmp_path / "stream", tile_size_m=20, format="streamed-sog", merge="union")
         with raises(ConfigError, code="no_exact_transform"):
             m.export(tmp_path / "globe", tile_size_m=20, format="3dtiles", merge="union")
     world = json.loads((tmp_path / "plain" / "tiles.json").read_text())["components"][0]["world"]

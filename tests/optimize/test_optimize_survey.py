@@ -108,6 +108,10 @@ def test_points_that_are_less_precise_than_stated_are_seldom_taken_for_blunders(
             at = tie.S_world_map.apply(answer.poses[site.names[0]].S_map_scene.translation)
             wrong.append(np.linalg.norm(at - site.truth[0].translation) > 5 * sigma)
             tied += 1
+            given = replace(survey, points=tuple(points))
+            joint = joint_covariance(answer, site.edges, (), given, [site.names[0]], 0)
+            assert joint is not None
+            assert np.sqrt(np.diag(joint[:7, :7])) == pytest.approx(np.sqrt(np.diag(tie.covariance)), rel=0.05)
     assert tied >= 3
     assert sum(wrong) <= 1
 

@@ -28,6 +28,7 @@ import numpy as np
 import gsmap.map
 from gsmap import formats
 from gsmap.map import static_filter
+from gsmap.map.stages.change import standing_comparisons
 from gsmap.map.static_filter import DynamicContent
 from gsmap.types import PoseGraph, ScenePose
 from tools.harness import argument_parser
@@ -70,7 +71,7 @@ def score(truth: Truth) -> tuple[dict[str, Counter[str]], float]:
         started = time.process_time()
         known, _ = m.static_content()
         seconds = time.process_time() - started
-        passing = static_filter.find_dynamic_content(m.store, known)
+        passing = static_filter.find_dynamic_content(m.store, known, standing_comparisons(m.store, m.settings))
         changed = set()
         for a, b in combinations(truth.times, 2):
             for change in truth.changes(a, b):

@@ -18,7 +18,9 @@ import numpy as np
 from gsmap import formats
 from gsmap import map as maps
 from gsmap.change import compare
+from gsmap.geometry.metric_scale import in_metres
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.map.metric_scales import metres_of_scenes
 from gsmap.types import PosedScene
 from tools.harness import argument_parser
 
@@ -54,15 +56,16 @@ def placed(captures: list[Path], path: Path) -> list[PosedScene]:
             for k, capture in enumerate(captures):
                 m.update(capture, captured_at=f"{2025 + k // 12}-{k % 12 + 1:02d}-01")
     with maps.open(path) as m:
+        graph = m.store.revisions.get()
+        metres = {} if graph is None else metres_of_scenes(m.store, graph)
         rows = {row.name: row for row in m.scene_rows() if row.S_map_scene is not None}
     scenes = []
     for capture in captures:
         if capture.stem in rows:
             row = rows[capture.stem]
-            gaussians = transform_gaussians(formats.read(capture), row.S_map_scene)
-            cameras = transform_cameras(
-                formats.read_cameras(capture.with_name(f"{capture.stem}.cameras.json")), row.S_map_scene
-            )
+            S = in_metres(row.S_map_scene, metres[row.id])
+            gaussians = transform_gaussians(formats.read(capture), S)
+            cameras = transform_cameras(formats.read_cameras(capture.with_name(f"{capture.stem}.cameras.json")), S)
             scenes.append(PosedScene(gaussians, cameras, row.name, row.captured_at))
     return scenes
 

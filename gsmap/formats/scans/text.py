@@ -21,7 +21,7 @@ _COLOUR_STARTS = {4: (1, 0), 6: (0, 3, 1)}  # by the number of columns after x y
 
 def read(path: Path) -> Scan:
     """Read points from the first three columns. Three more columns of whole numbers from 0 to 255, directly after the
-    point, after an intensity or after a normal, are the colour; of four such columns, the first is the intensity.
+    point, after an intensity or after a normal, are the colour; of four such columns, those that are most alike.
     Spaces, commas or semicolons separate columns; lines before the first point, and lines that begin with ``#`` or
     ``//``, are skipped.
 
@@ -48,11 +48,14 @@ def read(path: Path) -> Scan:
     points, rest = rows[:, :3], rows[:, 3:]
     notes: tuple[str, ...] = ()
     starts = _COLOUR_STARTS.get(rest.shape[1], (0, 1, 3))
-    colours = next((c for k in starts if _are_bytes(c := rest[:, k : k + 3])), None)
+    found = [c for k in starts if _are_bytes(c := rest[:, k : k + 3])]
+    # Where an intensity and a class are bytes, too: the channels of a colour are alike.
+    colours = max(found, key=_likeness) if len(found) > 1 and rest.shape[1] == 4 else next(iter(found), None)
     if colours is None and rest.shape[1]:
         notes = (f"no colours from 0 to 255 were found in columns 4 to {3 + rest.shape[1]}, which were not used",)
-    elif rest.shape[1] == 4 and _are_bytes(rest[:, :3]) and _are_bytes(rest[:, 1:]):
-        notes = ("column 4 was read as the intensity, and columns 5 to 7 as the colour",)
+    elif colours is not None and rest.shape[1] == 4 and len(found) > 1:
+        first = 4 if np.array_equal(colours, rest[:, :3]) else 5
+        notes = (f"columns {first} to {first + 2} of 4 to 7 were read as the colour",)
     return scan_of(points, None if colours is None else colours / _BYTE, path, total, notes=notes)
 
 
@@ -80,6 +83,14 @@ def _layout(path: Path) -> tuple[int, re.Pattern[str], int]:
         f"{path} has no point in its first lines: a .xyz needs x y z in every line, with or without r g b after them",
         code="wrong_file_type",
     )
+
+
+def _likeness(values: np.ndarray) -> float:
+    """Return the mean correlation of three columns, 0 where one is constant."""
+    some = values[:: -(-len(values) // 100_000)]
+    if len(some) < 2 or (np.ptp(some, axis=0) == 0).any():
+        return 0.0
+    return float(np.corrcoef(some.T)[np.triu_indices(3, 1)].mean())
 
 
 def _are_bytes(values: np.ndarray) -> bool:

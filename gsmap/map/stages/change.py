@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -105,8 +105,17 @@ def missing_comparisons(store: Store, asked: ComparisonPlan, settings: Settings)
 
 
 def standing_comparisons(store: Store, settings: Settings) -> list[Comparison]:
-    """Return the comparisons of visits that hold, by whatever recipe: exports may act on their changes."""
-    return _standing(store.changes.current(), plan_comparisons(store, settings))
+    """Return the comparisons of visits that hold at the present poses, by whatever recipe, also of pairs that a person
+    asked for: exports may act on their changes."""
+    visits = plan_comparisons(store, settings).visits
+    dated = (one for one in store.changes.current() if one.older in visits and one.newer in visits)
+    return [
+        one
+        for one in dated
+        if visits[one.older].component == visits[one.newer].component
+        and visits[one.older].when < visits[one.newer].when
+        and _stands(one, visits)
+    ]
 
 
 def compare(
@@ -147,21 +156,21 @@ def compare(
     return len(jobs)
 
 
-def _standing(current: Iterable[Comparison], asked: ComparisonPlan) -> list[Comparison]:
-    """Return the comparisons of pairs of the plan at their present poses, and with arrays."""
+def _stands(one: Comparison, visits: Mapping[str, Visit]) -> bool:
+    """Return whether a comparison has its arrays, and was made at the present poses."""
+    return one.whole and not has_moved(visits[one.older], visits[one.newer], one.S_newer_older)
+
+
+def _valid(current: Iterable[Comparison], asked: ComparisonPlan, settings: Settings) -> list[Comparison]:
+    """Return the comparisons that are up to date."""
     pairs = set(asked.pairs)
     return [
         one
         for one in current
         if (one.older, one.newer) in pairs
-        and one.whole
-        and not has_moved(asked.visits[one.older], asked.visits[one.newer], one.S_newer_older)
+        and _stands(one, asked.visits)
+        and one.key == _key(settings, asked, one.older, one.newer).digest
     ]
-
-
-def _valid(current: Iterable[Comparison], asked: ComparisonPlan, settings: Settings) -> list[Comparison]:
-    """Return the comparisons that are up to date."""
-    return [one for one in _standing(current, asked) if one.key == _key(settings, asked, one.older, one.newer).digest]
 
 
 def _key(settings: Settings, asked: ComparisonPlan, older: str, newer: str) -> RecipeKey:

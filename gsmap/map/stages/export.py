@@ -330,7 +330,6 @@ def _export(
     layout: TreeLayout = Tiles3D(not request.uncompressed) if planned.recipe.is_tileset else StreamedSog()
     if planned.recipe.is_tree and is_stale(out, result.tiles, layout):
         in_metres_of = {component: metre.metres_per_unit for component, metre in planned.metres.items()}
-        S_ecef_map = {component: one.on_globe() for component, one in planned.world.items()}
         cameras, levels = partial(_cameras, store, planned), settings.export.levels
         progress(_TILES_SHARE, "levels of detail")
         if planned.recipe.is_tileset:
@@ -339,7 +338,7 @@ def _export(
                 out,
                 result.tiles,
                 in_metres_of,
-                S_ecef_map=S_ecef_map,
+                S_ecef_map={component: one.on_globe() for component, one in planned.world.items()},
                 compressed=packed,
                 cameras=cameras,
                 levels=levels,
