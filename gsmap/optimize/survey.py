@@ -20,12 +20,7 @@ from gsmap.optimize.gtsam_solve import anchor_directions
 from gsmap.optimize.measurements import all_rigid, measurements
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.survey_groups import SurveyFailure, solve_groups
-from gsmap.optimize.survey_report import (
-    Solution,
-    active_observations,
-    build_world_tie,
-    tie_by_bars,
-)
+from gsmap.optimize.survey_report import Solution, active_observations, build_world_tie, tie_by_bars
 from gsmap.optimize.survey_system import Component, System
 from gsmap.optimize.survey_terms import SurveyTerms
 from gsmap.types import Edge, PoseGraph, Prior, Sim3
@@ -108,7 +103,7 @@ def _with_honest_points(system: System, survey: Survey) -> tuple[System, Solutio
         times *= scatter
         note = (
             f"control points scatter beyond their stated standard deviations, so these were taken to be {times:.2g} "
-            f"times as large (--sigma states them)"
+            "times as large (--sigma states them)"
         )
         terms = SurveyTerms.of(_widened(survey, times), system.terms.scene_ids, system.own.dim)
         system = System(system.own, terms, system.scenes)

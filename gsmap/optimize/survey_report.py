@@ -74,7 +74,7 @@ def build_world_tie(system: System, solved: Solution, index: int, frame: WorldFr
     rows = _point_rows(system, solved, tests)
     rows += _image_rows(system, x, active, tests) + _fix_rows(system, solved, tests) + _bar_rows(system, solved, tests)
     covariance = world_covariance(system, factor)
-    factor_of = variance_factor(system, x, active, tests)
+    factor_of = _variance_factor(system, x, active, tests)
     notes = []
     if factor_of > 1:
         notes.append(
@@ -144,7 +144,7 @@ def world_covariance(system: System, factor: Factor) -> np.ndarray:
     return out
 
 
-def variance_factor(system: System, x: Unknowns, active: Active, tests: ObservationTests) -> float:
+def _variance_factor(system: System, x: Unknowns, active: Active, tests: ObservationTests) -> float:
     """Compute the variance factor of the used observations if chance does not explain their residuals; at least 1.
 
     It is the largest of all observations together and of each kind alone (points, images, fixes and bars), whose

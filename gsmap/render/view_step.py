@@ -123,14 +123,14 @@ class _Recorder:
     """
 
     def __init__(self) -> None:
-        self._runs: dict[object, int] = {}
+        self._ran: set[object] = set()
         self._graphs: dict[object, torch.cuda.CUDAGraph] = {}
         self._possible = gsplat.device().type == "cuda" and has_triton()
         if self._possible:
             self._stream, self._pool = torch.cuda.Stream(), torch.cuda.graph_pool_handle()
 
     def __call__(self, name: object, do: Callable[[], None]) -> None:
-        if name not in self._graphs and self._possible and self._runs.get(name):
+        if name not in self._graphs and self._possible and name in self._ran:
             try:
                 self._graphs[name] = self._record(do)
             except torch.cuda.OutOfMemoryError:
@@ -141,7 +141,7 @@ class _Recorder:
         if name in self._graphs:
             self._graphs[name].replay()
         else:
-            self._runs[name] = self._runs.get(name, 0) + 1
+            self._ran.add(name)
             do()
 
     def _record(self, do: Callable[[], None]) -> torch.cuda.CUDAGraph:

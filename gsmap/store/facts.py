@@ -12,6 +12,7 @@ from sqlalchemy import Connection, Row, insert, select
 
 from gsmap.errors import CorruptError, InputError
 from gsmap.store.catalog import now
+from gsmap.store.scene_refs import is_hexadecimal
 from gsmap.store.schema import scene_facts
 from gsmap.texts import control_characters
 
@@ -143,7 +144,7 @@ def validated_scene_name(name: str) -> str:
     Raises:
         InputError: it is no such name.
     """
-    if len(name) == 32 and all(c in "0123456789abcdef" for c in name):
+    if len(name) == 32 and is_hexadecimal(name):
         raise InputError(f"{name!r} has the form of the id of a scene: choose another name", code="invalid_name")
     return validated_text("the name of a scene", name)
 

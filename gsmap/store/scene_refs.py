@@ -100,6 +100,7 @@ def _by_prefix(connection: Connection, ref: str, which: Any) -> Sequence[Row[Any
 
 
 def is_hexadecimal(text: str) -> bool:
+    """Return whether a text consists of the digits of ids, which are lower case."""
     return all(c in "0123456789abcdef" for c in text)
 
 

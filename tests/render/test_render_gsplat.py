@@ -147,6 +147,20 @@ def test_the_loss_and_its_gradient_are_the_native_ones(device, ssim_weight, delt
         assert np.abs(2 * gradients[i].cpu().numpy() - gradient).max() <= 1e-4 * np.abs(gradient).max()
 
 
+def test_few_sizes_of_pictures_are_recorded_and_all_are_fitted(device, monkeypatch):
+    """A recorded size keeps memory, and tiles crop their views to many sizes."""
+    monkeypatch.setattr("gsmap.render.gsplat_fit._MOST_SIZES", 1)
+    gaussians, _ = scene(n=60)
+    fitters = [make_fitter(gaussians, backend=name) for name in ("native", "gsplat")]
+    for size in ((24, 16), (32, 20)):
+        _, cameras = scene(n=60, size=size)
+        image = np.zeros((1, size[1], size[0], 3), np.float32)
+        for step in range(4):
+            ours, theirs = (float(fitter.step(cameras, image)) for fitter in fitters)
+            assert ours == pytest.approx(theirs, rel=1e-3)
+            assert len(fitters[1]._view_steps) == int(size != (24, 16) or step >= 2)
+
+
 @pytest.mark.parametrize("capacity", [1 << 10, 1 << 12])
 def test_tile_lists_of_fixed_size_hold_what_gsplat_lists(device, capacity):
     gaussians, cameras = scene(n=250, size=(100, 70))
