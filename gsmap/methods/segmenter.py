@@ -9,7 +9,7 @@ from gsmap.types.views import Mask, SceneContext, View
 
 
 class Segmenter(Protocol):
-    """A segmenter for one scene."""
+    """A segmenter for one scene. If neither it nor the embedder has models, it is called from several threads."""
 
     def segment(self, view: View) -> list[Mask]:
         """Return the masks of a view, in any order; masks may overlap.

@@ -11,6 +11,7 @@
 #include "arrays.h"
 #include "memory.h"
 #include "rasteriser_view.h"
+#include "threads.h"
 
 namespace gsmap {
 namespace {
@@ -22,6 +23,8 @@ constexpr int SEGMENT = 4;   // cells along the last axis that are worked on, or
 constexpr int ROOM = 16;     // rows have so many cells, or a multiple; what is blurred beyond their ends is lost
 constexpr int MOST = 64 * SEGMENT;  // cells a side of a block: a word has a bit for each segment of a row
 constexpr int WINDOW = 2;    // a maximum is one among so many cells to either side
+constexpr int SLAB = 8;      // planes across the first axis into which one task spreads points
+constexpr std::size_t CHUNK = 16384;  // points of a task
 
 // Taps of a normalised Gaussian, three standard deviations to either side.
 std::vector<float> taps_of(double sigma) {
@@ -113,14 +116,14 @@ struct Rows {
 };
 
 // One pass along the first or second axis into the wanted segments of the row (x, y); `in` holds the rows from `first` on.
-void pass_across(const Grid &g, int x, int y, int axis, const std::vector<float> &taps, const Field &in, std::size_t first,
+void pass_across(const Grid &g, int x, int y, int axis, const std::vector<float> &taps, const float *in, std::size_t first,
                  const Flags &filled, std::uint64_t wanted, Rows &rows, float *out) {
     const int reach = int(taps.size()) / 2, at = axis == 0 ? x : y, length = axis == 0 ? g.nx : g.ny;
     const std::ptrdiff_t step = axis == 0 ? g.ny : 1;
     rows.clear();
     for (int k = std::max(-reach, -at); k <= std::min(reach, length - 1 - at); ++k) {
         const std::size_t row = g.row(x, y) + k * step;
-        if (filled[row] & wanted) rows.add(&in[g.at(row - first, 0)], filled[row], taps[k + reach]);
+        if (filled[row] & wanted) rows.add(in + g.at(row - first, 0), filled[row], taps[k + reach]);
     }
     kernels->blur_across(rows.at.data(), rows.filled.data(), rows.taps.data(), int(rows.at.size()), wanted, out);
 }
@@ -144,24 +147,27 @@ struct Blur {
     }
 
     // Plane by plane: `plane` holds one after the first pass, a line one of its rows after the second.
-    void operator()(const Grid &g, const Field &in, const Flags &filled, Field &plane, Field &out) const {
+    void operator()(const Grid &g, const Field &in, const Flags &filled, Field &out) const {
         const int reach = int(taps.size()) / 2, margin = (reach + SEGMENT - 1) / SEGMENT;  // cells, segments
-        Field line(std::size_t(g.segments + 2 * margin) * Grid::WIDTH);  // zero but for what the row holds
-        float *own = &line[margin * Grid::WIDTH];
-        Rows rows;
-        for (int x = 0; x < g.nx; ++x) {
+        parallel_for(g.nx, [&](int64_t task) {
+            static thread_local std::vector<float> plane;  // anything
+            if (plane.size() < g.at(g.ny, 0)) plane.resize(g.at(g.ny, 0));
+            std::vector<float> line(std::size_t(g.segments + 2 * margin) * Grid::WIDTH);  // zero but for what the row holds
+            float *own = &line[margin * Grid::WIDTH];
+            Rows rows;
+            const int x = int(task);
             for (int y = 0; y < g.ny; ++y)
                 if (const std::uint64_t wanted = after_x[g.row(x, y)])
-                    pass_across(g, x, y, 0, taps, in, 0, filled, wanted, rows, &plane[g.at(y, 0)]);
+                    pass_across(g, x, y, 0, taps, &in[0], 0, filled, wanted, rows, &plane[g.at(y, 0)]);
             for (int y = 0; y < g.ny; ++y) {
                 const std::size_t row = g.row(x, y);
                 if (!after_z[row]) continue;
-                pass_across(g, x, y, 1, taps, plane, g.row(x, 0), after_x, after_y[row], rows, own);
+                pass_across(g, x, y, 1, taps, plane.data(), g.row(x, 0), after_x, after_y[row], rows, own);
                 kernels->blur_along(own - reach * CHANNELS, CHANNELS, taps.data(), int(taps.size()), after_z[row],
                                     &out[g.at(row, 0)]);
                 each(after_y[row], [&](int s) { std::fill_n(own + s * Grid::WIDTH, Grid::WIDTH, 0.f); });
             }
-        }
+        });
     }
 };
 
@@ -194,20 +200,26 @@ inline double whole_of(double v) {
     return whole - (v < whole);
 }
 
-// All points as runs, by their blocks of cells of a size; and their coordinates in cells.
-std::vector<Run> runs_of(const Points &points, double size, double edge, Many<double> &cells) {
+// All points as runs, by their blocks of cells of a size.
+std::vector<Run> runs_of(const Points &points, double size, double edge) {
+    const std::size_t count = points.shape(0);
+    std::vector<std::vector<Run>> parts((count + CHUNK - 1) / CHUNK);
+    parallel_for(int64_t(parts.size()), [&](int64_t part) {
+        std::vector<Run> &runs = parts[part];
+        for (std::size_t i = part * CHUNK; i < std::min(count, (part + 1) * CHUNK); ++i) {
+            BlockIndex block;
+            double at[3];
+            for (int k = 0; k < 3; ++k) block[k] = whole_of((at[k] = points.data()[3 * i + k] / size) / edge);
+            if (runs.empty() || runs.back().block != block)
+                runs.push_back({block, i, i, {at[0], at[1], at[2]}, {at[0], at[1], at[2]}});
+            Run &run = runs.back();
+            run.end = i + 1;
+            for (int k = 0; k < 3; ++k)
+                run.low[k] = std::min(run.low[k], at[k]), run.high[k] = std::max(run.high[k], at[k]);
+        }
+    });
     std::vector<Run> runs;
-    cells.resize(3 * points.shape(0));
-    for (std::size_t i = 0; i < points.shape(0); ++i) {
-        BlockIndex block;
-        double *at = &cells[3 * i];
-        for (int k = 0; k < 3; ++k) block[k] = whole_of((at[k] = points.data()[3 * i + k] / size) / edge);
-        if (runs.empty() || runs.back().block != block)
-            runs.push_back({block, i, i, {at[0], at[1], at[2]}, {at[0], at[1], at[2]}});
-        Run &run = runs.back();
-        run.end = i + 1;
-        for (int k = 0; k < 3; ++k) run.low[k] = std::min(run.low[k], at[k]), run.high[k] = std::max(run.high[k], at[k]);
-    }
+    for (const auto &part : parts) runs.insert(runs.end(), part.begin(), part.end());
     std::sort(runs.begin(), runs.end(),
               [](const Run &a, const Run &b) { return std::tie(a.block, a.begin) < std::tie(b.block, b.begin); });
     return runs;
@@ -234,63 +246,101 @@ std::vector<Run> runs_near(const std::vector<Run> &runs, const BlockIndex &block
     return near;
 }
 
-// Points of one block and its halo, in cells, their colours and areas; and the block's least corner and shape.
-struct Block {
-    Many<double> points, lab, areas;
-    double low[3] = {};
-    int shape[3] = {};
+// What is spread over the cells: points, their colours and areas, in a unit of which a cell has a side and an area.
+struct Cloud {
+    const double *points;
+    const float *colours;
+    const double *areas;
+    double size, square;
+};
 
-    // In place of what was in it, whose memory is used again.
-    void fill(const Many<double> &cells, const Colours &colours, const Numbers &sizes, double square,
-              const std::vector<Run> &near, const double *core, double edge, double halo) {
-        double high[3] = {};
-        points.clear(), lab.clear(), areas.clear();
-        std::size_t most = 0;
-        for (const Run &run : near) most += run.end - run.begin;
-        points.reserve(3 * most), lab.reserve(3 * most), areas.reserve(most);  // takes no memory until it is used
-        for (const Run &run : near)
-            for (std::size_t i = run.begin; i < run.end; ++i) {
-                const double *at = &cells[3 * i];
-                bool inside = true;
-                for (int k = 0; k < 3; ++k) inside &= at[k] >= core[k] - halo && at[k] < core[k] + edge + halo;
-                if (!inside) continue;
-                for (int k = 0; k < 3; ++k) {
-                    low[k] = areas.empty() ? at[k] : std::min(low[k], at[k]);
-                    high[k] = areas.empty() ? at[k] : std::max(high[k], at[k]);
-                }
-                for (int k = 0; k < 3; ++k) points.push_back(at[k]), lab.push_back(colours.data()[3 * i + k]);
-                areas.push_back(sizes.data()[i] / square);
-            }
-        for (int k = 0; k < 3; ++k) {  // room for extrema just off the surface
-            low[k] = std::floor(low[k]) - 3;
-            shape[k] = int(std::floor(high[k]) - low[k]) + 4;
+// Where a point lies in the cells of a block: the least of the cells that it is spread over, and how far beyond its middle.
+struct Place {
+    int cell[3];
+    double beyond[3];
+
+    Place(const double *point, double size, const double *low) {
+        for (int k = 0; k < 3; ++k) {
+            const double at = point[k] / size - low[k] - 0.5;
+            cell[k] = floor_of(at);
+            beyond[k] = at - cell[k];
         }
     }
 };
 
-// Trilinear splatting of the points' surface, and of it times their colours, into cells; flags the segments.
-WIDE void splat(const Grid &g, const Block &block, Field &out, Flags &filled) {
-    typedef double Values __attribute__((vector_size(32)));
-    for (std::size_t i = 0; i < block.areas.size(); ++i) {
-        const double *lab = &block.lab[3 * i], area = block.areas[i];
-        const Values values = {area * (lab[0] - 50.0), area * lab[1], area * lab[2], area};
-        int base[3];
-        double t[3];
-        for (int k = 0; k < 3; ++k) {
-            const double at = block.points[3 * i + k] - block.low[k] - 0.5;
-            base[k] = floor_of(at);
-            t[k] = at - base[k];
+// One block and its halo: its least corner and shape, and the points in each slab of planes across the first axis.
+struct Block {
+    double low[3], high[3];
+    int shape[3] = {};
+    std::vector<Many<std::uint32_t>> rows;  // by slab, then by run, in the order of the points
+
+    Block(const Cloud &cloud, const std::vector<Run> &near, const double *core, double edge, double halo) {
+        std::vector<Run> inside(near);  // their boxes become those of the points inside
+        const auto holds = [&](const double *at) {
+            for (int k = 0; k < 3; ++k)
+                if (!(at[k] >= core[k] - halo && at[k] < core[k] + edge + halo)) return false;
+            return true;
+        };
+        const auto is_inside = [&](std::size_t i) {
+            const double *p = cloud.points + 3 * i, at[3] = {p[0] / cloud.size, p[1] / cloud.size, p[2] / cloud.size};
+            return holds(at);
+        };
+        parallel_for(int64_t(near.size()), [&](int64_t r) {
+            Run &run = inside[r];
+            if (holds(run.low) && holds(run.high)) return;
+            std::fill_n(run.low, 3, __builtin_inf()), std::fill_n(run.high, 3, -__builtin_inf());
+            for (std::size_t i = run.begin; i < run.end; ++i)
+                if (is_inside(i))
+                    for (int k = 0; k < 3; ++k) {
+                        const double at = cloud.points[3 * i + k] / cloud.size;
+                        run.low[k] = std::min(run.low[k], at), run.high[k] = std::max(run.high[k], at);
+                    }
+        });
+        std::fill_n(low, 3, __builtin_inf()), std::fill_n(high, 3, -__builtin_inf());
+        for (const Run &run : inside)
+            for (int k = 0; k < 3; ++k) low[k] = std::min(low[k], run.low[k]), high[k] = std::max(high[k], run.high[k]);
+        if (is_empty()) return;
+        for (int k = 0; k < 3; ++k) {  // room for extrema just off the surface
+            low[k] = std::floor(low[k]) - 3;
+            shape[k] = int(std::floor(high[k]) - low[k]) + 4;
         }
-        const int segment = base[2] / SEGMENT, next = (base[2] + 1) / SEGMENT;
-        for (int side = 0; side < 4; ++side) {
-            const int dx = side >> 1, dy = side & 1;
-            const double across = (dx ? t[0] : 1 - t[0]) * (dy ? t[1] : 1 - t[1]);
-            float *cell = &out[g.cell(base[0] + dx, base[1] + dy, base[2])];
-            *reinterpret_cast<Cell *>(cell) += __builtin_convertvector(across * (1 - t[2]) * values, Cell);
-            *reinterpret_cast<Cell *>(cell + CHANNELS) += __builtin_convertvector(across * t[2] * values, Cell);
-            filled[g.row(base[0] + dx, base[1] + dy)] |= std::uint64_t(1) << segment | std::uint64_t(1) << next;
-        }
+        rows.resize(slabs() * near.size());
+        parallel_for(int64_t(near.size()), [&](int64_t r) {
+            const bool whole = holds(near[r].low) && holds(near[r].high);
+            for (std::size_t i = near[r].begin; i < near[r].end; ++i) {
+                if (!whole && !is_inside(i)) continue;
+                const int cell = Place(cloud.points + 3 * i, cloud.size, low).cell[0];
+                for (int slab = cell / SLAB; slab <= (cell + 1) / SLAB; ++slab)
+                    rows[slab * near.size() + r].push_back(std::uint32_t(i));
+            }
+        });
     }
+    bool is_empty() const { return low[0] > high[0]; }
+    int slabs() const { return (shape[0] + SLAB - 1) / SLAB; }
+};
+
+// Trilinear splatting of the points' surface, and of it times their colours, into the cells of a slab; flags the segments.
+WIDE void splat(const Grid &g, const Cloud &cloud, const Block &block, int slab, Field &out, Flags &filled) {
+    typedef double Values __attribute__((vector_size(32)));
+    const std::size_t runs = block.rows.size() / block.slabs();
+    for (std::size_t r = slab * runs; r < (slab + 1) * runs; ++r)
+        for (const std::uint32_t i : block.rows[r]) {
+            const float *lab = cloud.colours + 3 * std::size_t(i);
+            const double area = cloud.areas[i] / cloud.square;
+            const Values values = {area * (lab[0] - 50.0), area * lab[1], area * lab[2], area};
+            const Place at(cloud.points + 3 * std::size_t(i), cloud.size, block.low);
+            const double *t = at.beyond;
+            const int segment = at.cell[2] / SEGMENT, next = (at.cell[2] + 1) / SEGMENT;
+            for (int side = 0; side < 4; ++side) {
+                const int x = at.cell[0] + (side >> 1), y = at.cell[1] + (side & 1);
+                if (x / SLAB != slab) continue;
+                const double across = (side >> 1 ? t[0] : 1 - t[0]) * (side & 1 ? t[1] : 1 - t[1]);
+                float *cell = &out[g.cell(x, y, at.cell[2])];
+                *reinterpret_cast<Cell *>(cell) += __builtin_convertvector(across * (1 - t[2]) * values, Cell);
+                *reinterpret_cast<Cell *>(cell + CHANNELS) += __builtin_convertvector(across * t[2] * values, Cell);
+                filled[g.row(x, y)] |= std::uint64_t(1) << segment | std::uint64_t(1) << next;
+            }
+        }
 }
 
 // The maxima of a channel times a sign within their windows, at one cell.
@@ -325,16 +375,12 @@ void maximum(const Grid &g, const Field &response, const int *shape, int x, int 
 struct Work {
     Field field;   // zero between blocks
     Field smooth;  // anything
-    Field plane;   // anything
-    Many<double> cells;  // of points
-    Block block;
     bool whole = true;  // no block was left half done
 
     // Makes room for the largest block.
     void reserve(const Grid &largest) {
         if (!whole || field.size() < largest.values()) field = Field(), field = Field(largest.values());
         if (smooth.size() < largest.values()) smooth = Field(), smooth = Field(largest.values());
-        if (plane.size() < largest.at(largest.ny, 0)) plane = Field(largest.at(largest.ny, 0));
     }
 };
 
@@ -349,19 +395,20 @@ Grid largest(const std::vector<Run> &runs, double cells) {
     return Grid(shape[0], shape[1], shape[2]);
 }
 
-void empty(const Grid &g, Field &field, const Flags &flags) {
-    for (std::size_t row = 0; row < flags.size(); ++row)
-        each(flags[row], [&](int s) { std::fill_n(&field[g.at(row, s)], Grid::WIDTH, 0.f); });
-}
-
 inline Cell &cell_of(Field &values, std::size_t cell) { return *reinterpret_cast<Cell *>(&values[cell]); }
 
 // Whether a cell, of this mass after the first blur, belongs to the surface.
 inline bool is_surface(float mass, float of_plane) { return mass * of_plane > 0.3f; }
 
-// Flags the segments that hold surface.
-WIDE void flag_surface(const Grid &g, const Field &smooth, const Flags &filled, float of_plane, Flags &surface) {
-    for (std::size_t row = 0; row < g.rows(); ++row)
+// Empties flagged segments of a plane across the first axis.
+void empty(const Grid &g, int x, Field &field, const Flags &flags) {
+    for (std::size_t row = g.row(x, 0); row < g.row(x + 1, 0); ++row)
+        each(flags[row], [&](int s) { std::fill_n(&field[g.at(row, s)], Grid::WIDTH, 0.f); });
+}
+
+// Flags the segments of a plane that hold surface.
+WIDE void flag_surface(const Grid &g, int x, const Field &smooth, const Flags &filled, float of_plane, Flags &surface) {
+    for (std::size_t row = g.row(x, 0); row < g.row(x + 1, 0); ++row)
         each(filled[row], [&](int s) {
             bool any = false;
             for (int c = 0; c < SEGMENT; ++c) any |= is_surface(smooth[g.at(row, s) + c * CHANNELS + 3], of_plane);
@@ -369,9 +416,9 @@ WIDE void flag_surface(const Grid &g, const Field &smooth, const Flags &filled, 
         });
 }
 
-// The differences between the means of both blurs, in place of those of the second; and the excess of surface.
-WIDE void respond(const Grid &g, Field &smooth, const Flags &surface, float of_plane, Field &field) {
-    for (std::size_t row = 0; row < g.rows(); ++row)
+// The differences between the means of both blurs, in place of those of the second; and the excess of surface. Of a plane.
+WIDE void respond(const Grid &g, int x, Field &smooth, const Flags &surface, float of_plane, Field &field) {
+    for (std::size_t row = g.row(x, 0); row < g.row(x + 1, 0); ++row)
         each(surface[row], [&](int s) {
             for (std::size_t cell = g.at(row, s); cell < g.at(row, s + 1); cell += CHANNELS) {
                 const float mass = smooth[cell + 3], around = field[cell + 3];
@@ -384,21 +431,24 @@ WIDE void respond(const Grid &g, Field &smooth, const Flags &surface, float of_p
 }
 
 // See gsmap/describe/landmarks/detect.py.
-std::vector<Extremum> extrema(const Block &block, Work &work, const double *thresholds, double sigma, double surround) {
+std::vector<Extremum> extrema(const Cloud &cloud, const Block &block, Work &work, const double *thresholds, double sigma,
+                              double surround) {
     const int *shape = block.shape;
     const Grid g(shape[0], shape[1], shape[2]);
-    Field &field = work.field, &smooth = work.smooth, &plane = work.plane;
+    Field &field = work.field, &smooth = work.smooth;
     Flags filled(g.rows(), 0), surface(g.rows(), 0);
-    splat(g, block, field, filled);
+    parallel_for(block.slabs(), [&](int64_t slab) { splat(g, cloud, block, int(slab), field, filled); });
     const Blur near(g, sigma, filled, nullptr);
-    near(g, field, filled, plane, smooth);
-    empty(g, field, filled);
+    near(g, field, filled, smooth);
     const float of_plane = float(std::sqrt(2 * 3.14159265358979323846) * sigma);
-    flag_surface(g, smooth, near.after_z, of_plane, surface);
+    parallel_for(g.nx, [&](int64_t x) {
+        empty(g, int(x), field, filled);
+        flag_surface(g, int(x), smooth, near.after_z, of_plane, surface);
+    });
     const Blur far(g, sigma * std::sqrt(surround * surround - 1), near.after_z, &surface);
-    far(g, smooth, near.after_z, plane, field);
+    far(g, smooth, near.after_z, field);
     Field &response = field;  // takes the place of what is around
-    respond(g, smooth, surface, of_plane, response);
+    parallel_for(g.nx, [&](int64_t x) { respond(g, int(x), smooth, surface, of_plane, response); });
     Cell about;  // no more than the thresholds: most cells are far below
     for (int c = 0; c < CHANNELS; ++c) about[c] = std::nextafter(float(thresholds[c]), 0.f);
     const auto is_far_below = [&](const Cell &cell) {
@@ -407,8 +457,9 @@ std::vector<Extremum> extrema(const Block &block, Work &work, const double *thre
         std::memcpy(any, &high, sizeof any);
         return !(any[0] | any[1]);
     };
-    std::vector<Extremum> found;
-    for (int x = 0; x < g.nx; ++x)
+    std::vector<std::vector<Extremum>> found(g.nx);
+    parallel_for(g.nx, [&](int64_t plane) {
+        const int x = int(plane);
         for (int y = 0; y < g.ny; ++y)
             each(surface[g.row(x, y)], [&](int s) {
                 for (int z = s * SEGMENT; z < std::min((s + 1) * SEGMENT, shape[2]); ++z) {
@@ -416,14 +467,16 @@ std::vector<Extremum> extrema(const Block &block, Work &work, const double *thre
                     for (int c = 0; c < CHANNELS; ++c) {
                         const float value = response[g.cell(x, y, z) + c];
                         if (value > thresholds[c])
-                            maximum(g, response, shape, x, y, z, c, 1.f, thresholds[c], found);
+                            maximum(g, response, shape, x, y, z, c, 1.f, thresholds[c], found[x]);
                         else if (c < 3 && -value > thresholds[c])
-                            maximum(g, response, shape, x, y, z, c, -1.f, thresholds[c], found);
+                            maximum(g, response, shape, x, y, z, c, -1.f, thresholds[c], found[x]);
                     }
                 }
             });
-    empty(g, response, surface);
-    return found;
+    });
+    parallel_for(g.nx, [&](int64_t x) { empty(g, int(x), response, surface); });
+    for (int x = 1; x < g.nx; ++x) found[0].insert(found[0].end(), found[x].begin(), found[x].end());
+    return std::move(found[0]);
 }
 
 }  // namespace
@@ -447,18 +500,18 @@ void bind_landmarks(nb::module_ &m) {
             std::vector<double> rows;
             {
                 nb::gil_scoped_release release;
-                const std::vector<Run> runs = runs_of(points, size, edge, work.cells);
+                const Cloud cloud{points.data(), lab.data(), areas.data(), size, square};
+                const std::vector<Run> runs = runs_of(points, size, edge);
                 work.reserve(largest(runs, edge + 2 * halo));
                 work.whole = false;
-                Block &block = work.block;
                 for (std::size_t r = 0; r < runs.size(); ++r) {
                     if (r && runs[r].block == runs[r - 1].block) continue;
                     double core[3];
                     for (int k = 0; k < 3; ++k) core[k] = runs[r].block[k] * edge;
                     const auto near = runs_near(runs, runs[r].block, edge, halo);
-                    block.fill(work.cells, lab, areas, square, near, core, edge, halo);
-                    if (block.areas.empty()) continue;
-                    for (Extremum &e : extrema(block, work, thresholds.data(), sigma, surround)) {
+                    const Block block(cloud, near, core, edge, halo);
+                    if (block.is_empty()) continue;
+                    for (Extremum &e : extrema(cloud, block, work, thresholds.data(), sigma, surround)) {
                         bool own = true;
                         for (int k = 0; k < 3; ++k) {
                             e.position[k] = e.position[k] + block.low[k] + 0.5;

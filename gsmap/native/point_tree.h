@@ -2,9 +2,10 @@
 #pragma once
 #include <algorithm>
 #include <cstdint>
-#include <numeric>
+#include <vector>
 
 #include "memory.h"
+#include "threads.h"
 
 namespace gsmap {
 
@@ -17,15 +18,22 @@ struct Neighbour {
 template <int kAxes> class Tree {
   public:
     // Copies n rows of finite numbers.
-    Tree(const double *points, int32_t n) : points_(points, points + kAxes * std::size_t(n)), rows_(n) {
-        std::iota(rows_.begin(), rows_.end(), 0);
-        if (n) build(0, n);
-        sorted_.resize(kAxes * std::size_t(n));
-        for (int32_t i = 0; i < n; ++i) std::copy_n(point(rows_[i]), kAxes, &sorted_[kAxes * std::size_t(i)]);
+    Tree(const double *points, int32_t n) : points_(points, points + kAxes * std::size_t(n)), sorted_(n) {
+        if (!n) return;
+        for (int32_t i = 0; i < n; ++i) std::copy_n(point(i), kAxes, sorted_[i].at), sorted_[i].row = i;
+        nodes_.resize(nodes_of(n));
+        std::vector<Part> parts{{0, 0, n}};
+        while (parts.size() < kParts && n / int32_t(parts.size()) > kLargest) {
+            parallel_for(int64_t(parts.size()), [&](int64_t i) { split(parts[i]); });
+            std::vector<Part> halves;
+            for (const Part &part : parts) halves.push_back(half(part, 0)), halves.push_back(half(part, 1));
+            parts.swap(halves);
+        }
+        parallel_for(int64_t(parts.size()), [&](int64_t i) { build(parts[i]); });
     }
-    int32_t size() const { return int32_t(rows_.size()); }
-    // Rows, those near each other together.
-    const Many<int32_t> &order() const { return rows_; }
+    int32_t size() const { return int32_t(sorted_.size()); }
+    // The row of a place in an order in which rows near each other are together.
+    int32_t row(int64_t place) const { return sorted_[place].row; }
     const double *point(int32_t row) const { return &points_[kAxes * std::size_t(row)]; }
 
     static double squared(const double *a, const double *b) {
@@ -72,37 +80,58 @@ template <int kAxes> class Tree {
   private:
     static constexpr int32_t kLeaf = 12;
     static constexpr int kDeepest = 32;  // halves of what an int32_t counts
+    static constexpr int32_t kParts = 128, kLargest = 8192;  // parts of larger trees are built side by side
+    struct Item {
+        double at[kAxes];
+        int32_t row;
+        bool before(const Item &o, int axis) const {
+            return at[axis] < o.at[axis] || (at[axis] == o.at[axis] && row < o.row);
+        }
+    };
     struct Node {
         double split;
         int32_t begin, end, right;  // of a leaf right is 0; the left child is the next node
         int axis;
     };
+    struct Part {
+        int32_t node, begin, end;
+    };
 
-    int32_t build(int32_t begin, int32_t end) {
-        const int32_t at = int32_t(nodes_.size());
-        nodes_.push_back({0, begin, end, 0, 0});
-        if (end - begin <= kLeaf) return at;
+    // Nodes of a tree of n points, whose parts of one level differ by one point at most.
+    static int32_t nodes_of(int32_t n) {
+        int32_t parts = 1;
+        while (n / parts > kLeaf) parts *= 2;
+        return 2 * parts - 1 + 2 * std::max(n - parts * kLeaf, 0);
+    }
+    Part half(const Part &part, int which) const {
+        const int32_t middle = part.begin + (part.end - part.begin) / 2;
+        return which ? Part{nodes_[part.node].right, middle, part.end} : Part{part.node + 1, part.begin, middle};
+    }
+    // Makes a node, and returns whether it has halves.
+    bool split(const Part &part) {
+        const auto [at, begin, end] = part;
+        nodes_[at] = {0, begin, end, 0, 0};
+        if (end - begin <= kLeaf) return false;
         double low[kAxes], high[kAxes];
-        std::fill_n(low, kAxes, __builtin_inf()), std::fill_n(high, kAxes, -__builtin_inf());
+        std::copy_n(sorted_[begin].at, kAxes, low), std::copy_n(low, kAxes, high);
         for (int32_t i = begin; i < end; ++i)
             for (int a = 0; a < kAxes; ++a) {
-                low[a] = std::min(low[a], point(rows_[i])[a]);
-                high[a] = std::max(high[a], point(rows_[i])[a]);
+                low[a] = std::min(low[a], sorted_[i].at[a]);
+                high[a] = std::max(high[a], sorted_[i].at[a]);
             }
         int axis = 0;
         for (int a = 1; a < kAxes; ++a)
             if (high[a] - low[a] > high[axis] - low[axis]) axis = a;
         const int32_t middle = begin + (end - begin) / 2;
-        std::nth_element(rows_.begin() + begin, rows_.begin() + middle, rows_.begin() + end, [&](int32_t i, int32_t j) {
-            const double x = point(i)[axis], y = point(j)[axis];
-            return x < y || (x == y && i < j);
-        });
+        std::nth_element(sorted_.begin() + begin, sorted_.begin() + middle, sorted_.begin() + end,
+                         [axis](const Item &a, const Item &b) { return a.before(b, axis); });
         nodes_[at].axis = axis;
-        nodes_[at].split = point(rows_[middle])[axis];
-        build(begin, middle);
-        const int32_t right = build(middle, end);
-        nodes_[at].right = right;
-        return at;
+        nodes_[at].split = sorted_[middle].at[axis];
+        nodes_[at].right = at + 1 + nodes_of(middle - begin);
+        return true;
+    }
+    void build(const Part &part) {
+        if (split(part)) build(half(part, 0)), build(half(part, 1));
     }
 
     // A half that was passed by on the way down: how far its box lies from `at`, along the axis of the split and in all.
@@ -125,7 +154,7 @@ template <int kAxes> class Tree {
             node = left ? node + 1 : n->right;
         }
         for (int32_t i = n->begin; i < n->end; ++i) {
-            const Neighbour found{squared(at, &sorted_[kAxes * std::size_t(i)]), rows_[i]};
+            const Neighbour found{squared(at, sorted_[i].at), sorted_[i].row};
             if (found.squared <= best.squared) take(best, found);
         }
         while (deep) {
@@ -139,8 +168,8 @@ template <int kAxes> class Tree {
         }
     }
 
-    Many<double> points_, sorted_;
-    Many<int32_t> rows_;
+    Many<double> points_;
+    Many<Item> sorted_;
     Many<Node> nodes_;
 };
 

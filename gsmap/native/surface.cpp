@@ -389,7 +389,7 @@ void bind_surface(nb::module_ &m) {
                     over_blocks(int64_t(n), [&](int64_t, int64_t begin, int64_t end) {
                         Neighbour near[kMostNeighbours];
                         for (int64_t i = begin; i < end; ++i) {
-                            const int64_t at = places ? i : tree.order()[i];
+                            const int64_t at = places ? i : tree.row(i);
                             const double *place = places ? places->data() + 3 * i : tree.point(int32_t(at));
                             for (int j = 0, found = tree.nearest(place, k, near, radius * radius); j < found; ++j) {
                                 distance[at * k + j] = std::sqrt(near[j].squared);
@@ -415,7 +415,7 @@ void bind_surface(nb::module_ &m) {
                     over_blocks(tree.size(), [&](int64_t, int64_t begin, int64_t end) {
                         Neighbour near[kMostNeighbours];
                         for (int64_t i = begin; i < end; ++i) {
-                            const int32_t at = tree.order()[i];
+                            const int32_t at = tree.row(i);
                             double least = __builtin_inf();
                             for (int j = 0, found = tree.nearest(tree.point(at), k + 1, near); j < found; ++j) {
                                 if (j == k) far[at] = std::sqrt(near[j].squared);

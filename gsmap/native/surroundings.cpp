@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "arrays.h"
+#include "threads.h"
 
 namespace gsmap {
 namespace {
@@ -97,7 +98,7 @@ void surroundings(const Points &positions, const Points &points, const Points &v
     const bool upright = !heights.empty();
     const Columns columns(points, values, reach / 6);
     const double bottom = upright ? heights.front() : -reach, top = upright ? heights.back() : reach;
-    for (std::size_t m = 0; m < positions.shape(0); ++m) {
+    parallel_for(int64_t(positions.shape(0)), [&](int64_t m) {
         const double *p = positions.data() + 3 * m;
         double *sum = sums + m * rings * levels * 3, *count = counts + m * rings * levels;
         const int x1 = columns.at(p[0] + reach, 0);
@@ -126,7 +127,7 @@ void surroundings(const Points &positions, const Points &points, const Points &v
                 }
             }
         }
-    }
+    });
 }
 
 }  // namespace

@@ -8,7 +8,7 @@ from gsmap.geometry import neighbours
 from gsmap.geometry.neighbours import chunks_of_neighbours, nearest_neighbours, nearest_of, neighbours_of, spatial_order
 
 
-@pytest.mark.parametrize("count", [0, 1, 5, 3000])
+@pytest.mark.parametrize("count", [0, 1, 5, 25, 3000, 20_000])
 def test_neighbours_are_those_of_a_search_tree(count, monkeypatch):
     monkeypatch.setattr(neighbours, "_CHUNK", 700)
     points = np.random.default_rng(count).normal(size=(count, 3)) * [5, 1, 0.2]

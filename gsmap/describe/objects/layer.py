@@ -19,7 +19,7 @@ from gsmap.types import Cameras, Gaussians, NodeLayer
 from gsmap.types.model import ModelLimits, ModelSpec
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
-from gsmap.types.views import SceneContext
+from gsmap.types.views import SceneContext, View
 
 VERSION = 4
 _NEAR_M = 0.1  # a view that is mostly nearer than this is inside an object and left out
@@ -173,6 +173,8 @@ def object_layer(
     Raises:
         ConfigError: a method does not exist or lacks its model.
     """
+    from gsmap.geometry.threads import map_ahead  # imported here, as the recipe key does not need it
+
     descriptor = descriptor_id(params or Params(), context.models)
     chosen = choose_methods(params or Params(), context.models)
     params = chosen.params
@@ -190,11 +192,12 @@ def object_layer(
             ["the scene has no cameras, so objects are not computed"] if len(cloud) else []
         )
     sampled = cameras.evenly(params.num_cameras)
-    for i, view in enumerate(render_views(gaussians, sampled, params.longest_side_px, params.render_backend)):
-        progress(i / len(sampled), f"objects, view {i + 1} of {len(sampled)}")
+
+    def find_regions(at: tuple[int, View]) -> list[Node] | None:
+        """Return the regions of a view; None if its camera is blocked."""
+        i, view = at
         if is_blocked(view, _NEAR_M / unit_m):
-            blocked += 1
-            continue
+            return None
         rows, pixel = find_visible(cloud.points, view, params.depth_tolerance)
         masks, points = [], []
         for mask in segmenter.segment(view):
@@ -202,10 +205,18 @@ def object_layer(
             if mask.confidence >= params.min_confidence and len(shown) >= _MIN_POINTS:
                 masks.append(mask)
                 points.append(shown)
-        features = embedder.embed(view, masks, points)
-        for mask, shown, feature in zip(masks, points, features, strict=True):
-            found = make_region(shown @ level.T, feature, mask.confidence, i, cell, mask.part)
-            associate(nodes, found, _MIN_SIMILARITY, cell)
+        return [
+            make_region(shown @ level.T, feature, mask.confidence, i, cell, mask.part)
+            for mask, shown, feature in zip(masks, points, embedder.embed(view, masks, points), strict=True)
+        ]
+
+    views = enumerate(render_views(gaussians, sampled, params.longest_side_px, params.render_backend))
+    threads = 1 if chosen.kinds else None  # a model runs on one picture at a time
+    for i, regions in enumerate(map_ahead(find_regions, views, threads)):
+        progress(i / len(sampled), f"objects, view {i + 1} of {len(sampled)}")
+        blocked += regions is None
+        for region in regions or ():
+            associate(nodes, region, _MIN_SIMILARITY, cell)
     enough = min(params.min_views, len(sampled) - blocked)
     nodes = [n for n in nodes if len(n.views) >= enough]
     notes = list(chosen.fallbacks)

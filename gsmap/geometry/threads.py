@@ -1,0 +1,38 @@
+"""Run Python functions on as many threads as native kernels use (`gsmap.render.set_num_threads`)."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+from gsmap._native import num_threads
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def map_ahead(
+    function: Callable[[Item], Result], items: Iterable[Item], threads: int | None = None
+) -> Iterator[Result]:
+    """Yield the results of a function, in the order of the items, while threads compute those of the next items.
+
+    Args:
+        items: taken by the calling thread, at most two for each thread before their results.
+        threads: 1 runs the function in the calling thread; None takes the number of threads of native kernels.
+    """
+    threads = num_threads() if threads is None else threads
+    if threads == 1:
+        yield from map(function, items)
+        return
+    pool, pending = ThreadPoolExecutor(threads), deque[Future[Result]]()
+    try:
+        for item in items:
+            pending.append(pool.submit(function, item))
+            if len(pending) > 2 * threads:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
