@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -13,8 +14,9 @@ from gsmap.merge import photos
 from gsmap.merge.changes import ResolvedScenes, newest_first
 from gsmap.merge.overlap import share_in_view
 from gsmap.merge.reference_view_cache import surface_axes
-from gsmap.merge.sharpness import SharpnessComparison, SharpnessWeights, compared_views
+from gsmap.merge.sharpness import Compared, SharpnessComparison, SharpnessWeights, compared_views
 from gsmap.render import ChunkIndex, Rendering, render
+from gsmap.render.threads import in_order
 from gsmap.types import Cameras, Gaussians, PosedScene
 from gsmap.types.progress import Progress
 
@@ -59,6 +61,28 @@ class References:
 
     def __len__(self) -> int:
         return len(self.images)
+
+
+@dataclass(frozen=True, eq=False)
+class _Counted:
+    """Visibility of a scene's (N,) Gaussians in a view: the pixels that each dominates, those of them that no change
+    disputes, and the largest weights."""
+
+    pixels: np.ndarray
+    sure: np.ndarray
+    largest: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A rendered reference view; see `References`. ``points`` are those of `_coarse_points`."""
+
+    camera: Cameras
+    image: np.ndarray
+    weight: np.ndarray
+    share: float
+    points: np.ndarray
+    compared: Compared
 
 
 def render_references(
@@ -116,25 +140,30 @@ def render_references(
         for index, piece, scene in zip(indices, pieces, scenes, strict=True)
     ]
     comparison, compared = SharpnessComparison(pieces, indices), compared_views([i for i, _, _ in todo])
-    for done, (i, c, camera) in enumerate(todo):
-        progress(done / len(todo), "rendering reference views")
-        disputed = None
+    one_at_a_time = threading.Lock()  # what scenes keep of their views and changes is not made for threads
+
+    def look(one: tuple[int, tuple[int, int, Cameras]]) -> tuple[int, _Counted | None, _View | None]:
+        done, (i, c, camera) = one
+        disputed = counted = None
         if (shared := reference_views[i]) is not None:
-            sight = shared.of(c)
-            shared.count(sight, pixels[i], largest[i])
-            if not shared.touches(sight, bounds, halo_m / 2):
-                continue
-            depth = shared.depth(sight)
+            with one_at_a_time:
+                sight = shared.of(c)
+                shared.count(sight, pixels[i], largest[i])
+                if not shared.touches(sight, bounds, halo_m / 2):
+                    return i, None, None
+                depth = shared.depth(sight)
         else:
             seen = render(scenes[i].gaussians, camera, max_weight=True, index=whole_indices[i])
-            disputed = settled.outdated_pixels(i, camera) if settled is not None and settled.is_disputed(i) else None
-            _count(seen, disputed, pixels[i], sure[i], largest[i])
+            if settled is not None and settled.is_disputed(i):
+                with one_at_a_time:
+                    disputed = settled.outdated_pixels(i, camera)
+            counted = _count(seen, disputed)
             depth = seen.depth[0]
         counts = inside_pixels(camera, depth, bounds, halo_m / 2)
         if disputed is not None:
             counts &= ~disputed
         if counts.mean() < _MIN_TILE_FRACTION:  # a weight is at most 1
-            continue
+            return i, counted, None
         window = _window(counts)
         if shared is None and pieces[i] is scenes[i].gaussians:
             colour, alpha = seen.colour[0][window], seen.alpha[0][window]
@@ -144,16 +173,27 @@ def render_references(
         weight = alpha * counts[window]
         share = float(weight.sum() / counts.size)
         if share < _MIN_TILE_FRACTION:
+            return i, counted, None
+        camera, depth, colour = _cropped(camera, window), depth[window], np.clip(colour, 0, 1)
+        parts = comparison.compare(i, camera, colour, depth, weight > _MIN_COMPARED_WEIGHT) if done in compared else {}
+        image, weight = np.round(colour * 255).astype(np.uint8), np.round(np.clip(weight, 0, 1) * 255).astype(np.uint8)
+        return i, counted, _View(camera, image, weight, share, _coarse_points(camera, depth), parts)
+
+    for done, (i, counted, view) in enumerate(in_order(look, enumerate(todo))):
+        progress(done / len(todo), "rendering reference views")
+        if counted is not None:
+            pixels[i] += counted.pixels
+            sure[i] += counted.sure
+            np.maximum(largest[i], counted.largest, out=largest[i])
+        if view is None:
             continue
-        cameras.append(_cropped(camera, window))
-        colour = np.clip(colour, 0, 1)
-        images.append(np.round(colour * 255).astype(np.uint8))
-        weights.append(np.round(np.clip(weight, 0, 1) * 255).astype(np.uint8))
+        cameras.append(view.camera)
+        images.append(view.image)
+        weights.append(view.weight)
         kept.append(i)
-        shares.append(share)
-        places.append(_coarse_points(cameras[-1], depth[window]))
-        if done in compared:
-            comparison.add(i, cameras[-1], colour, depth[window], weight > _MIN_COMPARED_WEIGHT)
+        shares.append(view.share)
+        places.append(view.points)
+        comparison.add(view.compared)
     num_rendered = len(kept)
     for i, one in _photos(scenes, pieces, longest_side_px) if photo_weight else ():
         counts = one.counts & inside_pixels(one.camera, one.depth, bounds, halo_m / 2)
@@ -241,17 +281,12 @@ def _best_views(
     return [todo[row] for row in sorted(chosen)]
 
 
-def _count(
-    seen: Rendering, disputed: np.ndarray | None, pixels: np.ndarray, sure: np.ndarray, largest: np.ndarray
-) -> None:
-    """Add the pixels that each Gaussian dominates to ``pixels``, undisputed ones to ``sure``; update ``largest``."""
+def _count(seen: Rendering, disputed: np.ndarray | None) -> _Counted:
     dominant = seen.dominant_id[0]
-    shown = np.bincount(dominant[dominant >= 0], minlength=len(pixels))
-    pixels += shown
+    pixels = sure = np.bincount(dominant[dominant >= 0], minlength=len(seen.max_weight))
     if disputed is not None:
-        shown = np.bincount(dominant[(dominant >= 0) & ~disputed], minlength=len(pixels))
-    sure += shown
-    np.maximum(largest, seen.max_weight, out=largest)
+        sure = np.bincount(dominant[(dominant >= 0) & ~disputed], minlength=len(pixels))
+    return _Counted(pixels, sure, seen.max_weight)
 
 
 def _coarse_points(camera: Cameras, depth: np.ndarray) -> np.ndarray:

@@ -34,6 +34,10 @@ _REVERSE_POWER = 2.0  # power of the ratio of both scenes' slopes, which is 1 wh
 _MIN_SLOPE, _MIN_WEIGHT = 1e-3, 0.02
 
 
+Compared = dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
+"""Per scene and other scene, (M,) cells and their (M, 3) sums over pixels."""
+
+
 @dataclass(eq=False)
 class SharpnessComparison:
     """Comparison of the fine detail of S overlapping scenes, view by view.
@@ -47,8 +51,10 @@ class SharpnessComparison:
     indices: Sequence[ChunkIndex]
     _sums: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
 
-    def add(self, scene: int, camera: Cameras, colour: np.ndarray, depth: np.ndarray, valid: np.ndarray) -> None:
-        """Compare one of a scene's own views with renders of the other scenes from its camera.
+    def compare(
+        self, scene: int, camera: Cameras, colour: np.ndarray, depth: np.ndarray, valid: np.ndarray
+    ) -> Compared:
+        """Compare one of a scene's own views with renders of the other scenes from its camera, for `add`.
 
         Args:
             camera: one camera in the map frame.
@@ -60,6 +66,7 @@ class SharpnessComparison:
         used = valid[few]
         own, depths = _detail(colour)[used], depth[few][used]
         cells = _cells(np.stack([axis[used] for axis in surface_axes(camera, depth, _STRIDE_PX)], axis=-1))
+        found: Compared = {}
         for other, piece in enumerate(self.pieces):
             if other == scene or not len(piece) or not share_in_view(camera, piece.means)[0]:
                 continue
@@ -75,7 +82,13 @@ class SharpnessComparison:
             values = np.ones(len(detail)), (own[same] * detail).sum(1), (own[same] ** 2).sum(1)
             where, label = np.unique(cells[same], return_inverse=True)
             sums = np.stack([np.bincount(label, row) for row in values], axis=1)
-            self._sums.setdefault((scene, other), []).append((where, sums))
+            found[scene, other] = where, sums
+        return found
+
+    def add(self, compared: Compared) -> None:
+        """Add what a view shows."""
+        for pair, sums in compared.items():
+            self._sums.setdefault(pair, []).append(sums)
 
     def weights(self) -> SharpnessWeights:
         """Return the weights of all scenes by cell."""

@@ -41,12 +41,6 @@ def gsplat_available() -> bool:
     return bool(torch.cuda.is_available())
 
 
-@functools.cache
-def has_triton() -> bool:
-    """Return whether Triton is installed; without it torch runs the same operations, more slowly."""
-    return importlib.util.find_spec("triton") is not None
-
-
 def _has_driver() -> bool:
     """Return whether NVIDIA's driver is installed."""
     try:

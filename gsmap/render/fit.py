@@ -39,9 +39,9 @@ def make_fitter(
     """
     if resolved(backend) == "gsplat":
         require_torch("fits by gsplat")
-        from gsmap.render.gsplat_fit import GsplatFitter
+        from gsmap.render.cuda_fit import CudaFitter
 
-        return GsplatFitter(gaussians, learning_rates, frozen=frozen, options=options)
+        return CudaFitter(gaussians, learning_rates, frozen=frozen, options=options)
     from gsmap.render.native_fit import NativeFitter
 
     return NativeFitter(gaussians, learning_rates, frozen=frozen, options=options)

@@ -97,7 +97,7 @@ IDLE = {
 def _modules() -> list[Any]:
     skip: Callable[[str], bool] = lambda name: name.endswith("__main__") or "_native" in name  # noqa: E731
     names = [m.name for m in pkgutil.walk_packages(gsmap.__path__, "gsmap.") if not skip(m.name)]
-    left_out = (".cli", ".migrations", ".triton_kernels")  # the last needs Triton, and has no settings
+    left_out = (".cli", ".migrations")
     return [importlib.import_module(name) for name in names if not any(part in name for part in left_out)]
 
 

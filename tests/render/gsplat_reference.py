@@ -6,12 +6,18 @@ runs is gsmap's adapter, gsplat's glue and gsplat's reference mathematics: every
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import importlib.util
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
 
 import pytest
 import torch
 
-from gsmap.render import backends, gsplat
+from gsmap.render import backends, blending_weights, cuda_fit, cuda_kernels, gsplat
 
 MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE = 0.999, 1 / 255, 1e-4  # as its kernels have them
 
@@ -38,7 +44,28 @@ def gsplat_on_cpu(monkeypatch):
     monkeypatch.setattr(gsplat, "device", lambda: torch.device("cpu"))
     monkeypatch.setattr(gsplat, "_device_cache", gsplat._DeviceCache())
     monkeypatch.setattr(backends, "gsplat_available", lambda: True)
+    monkeypatch.setattr(cuda_fit, "launch", _launch)
+    monkeypatch.setattr(blending_weights, "launch", _launch)
     return package
+
+
+@functools.cache
+def _emulated_kernels():
+    """gsmap's CUDA kernels, compiled for the CPU; every thread is a fiber."""
+    here = Path(__file__).parent
+    with tempfile.TemporaryDirectory() as folder:
+        built = Path(folder) / "kernels.so"
+        includes = [f"-I{here}", f"-I{Path(cuda_kernels.__file__).parent}"]
+        flags = ["-O2", "-std=c++17", "-shared", "-fPIC", "-U_FORTIFY_SOURCE", *includes]
+        compiler = shutil.which("c++") or "g++"
+        subprocess.run([compiler, *flags, "-o", built, here / "emulated_kernels.cpp"], check=True)
+        return ctypes.CDLL(str(built))
+
+
+def _launch(file, kernel, blocks, threads, *arguments, shared=0, num_sh=None):
+    values = [ctypes.c_void_p(a.data_ptr()) if isinstance(a, torch.Tensor) else ctypes.c_int32(a) for a in arguments]
+    pointers = (ctypes.c_void_p * len(values))(*(ctypes.cast(ctypes.byref(v), ctypes.c_void_p) for v in values))
+    assert not _emulated_kernels().launch(kernel.encode(), blocks, threads, pointers)
 
 
 def _projection(means, covars, quats, scales, viewmats, Ks, width, height, opacities=None, packed=False, **options):

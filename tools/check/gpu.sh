@@ -55,7 +55,7 @@ wait "$native" || { tail -n 20 "$out/build.log"; exit 1; }
 
 # --- tests, then figures ---------------------------------------------------------------------------------------------
 say "tests"
-timeout "${TESTS_S:-90}" "$PYTHON" -m pytest -q -p no:cacheprovider tests/render/test_render_gsplat.py -k "${TESTS:-cuda or triton}" >"$out/tests.log" 2>&1 || status=1
+timeout "${TESTS_S:-90}" "$PYTHON" -m pytest -q -p no:cacheprovider tests/render/test_render_gsplat.py -k "${TESTS:-cuda}" >"$out/tests.log" 2>&1 || status=1
 tail -n "${TESTS_LINES:-25}" "$out/tests.log"
 declare -A limit=([kernels]=90 [fit]=60 [merge]=60 [describe]=70 [pairs]=170 [tile]=120 [memory]=60)
 for part in "${@:-kernels fit merge describe pairs tile memory}"; do

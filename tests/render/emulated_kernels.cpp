@@ -1,0 +1,37 @@
+// The CUDA kernels on the CPU, called by name as the CUDA driver calls them.
+#include "cuda_emulation.h"
+
+#include <string>
+#include <utility>
+
+static float shared_floats[1 << 16];
+#define SHARED_FLOATS(name) float *name = shared_floats
+#include "blending_weights.cu"
+#include "fitter.cu"
+
+template <class... T, size_t... I>
+void call(void (*kernel)(T...), void **arguments, unsigned grid, unsigned size, std::index_sequence<I...>) {
+    emulation::run(grid, size, [=] { kernel(*(T *)arguments[I]...); });
+}
+
+template <class... T> void call(void (*kernel)(T...), void **arguments, unsigned grid, unsigned size) {
+    call(kernel, arguments, grid, size, std::index_sequence_for<T...>());
+}
+
+extern "C" int launch(const char *name, unsigned grid, unsigned size, void **arguments) {
+    const std::string wanted = name;
+#define KERNEL(one)                                                 \
+    if (wanted == #one) {                                           \
+        call(one, arguments, grid, size);                           \
+        return 0;                                                   \
+    }
+    KERNEL(blend_weights)
+    KERNEL(project)
+    KERNEL(list_tiles)
+    KERNEL(blend)
+    KERNEL(blend_backward)
+    KERNEL(loss_slopes)
+    KERNEL(loss_gradient)
+    KERNEL(update)
+    return 1;
+}
