@@ -64,7 +64,7 @@ class References:
 
 
 @dataclass(frozen=True, eq=False)
-class _Counted:
+class _Visibility:
     """Visibility of a scene's (N,) Gaussians in a view: the pixels that each dominates, those of them that no change
     disputes, and the largest weights."""
 
@@ -142,7 +142,7 @@ def render_references(
     comparison, compared = SharpnessComparison(pieces, indices), compared_views([i for i, _, _ in todo])
     one_at_a_time = threading.Lock()  # what scenes keep of their views and changes is not made for threads
 
-    def look(one: tuple[int, tuple[int, int, Cameras]]) -> tuple[int, _Counted | None, _View | None]:
+    def look(one: tuple[int, tuple[int, int, Cameras]]) -> tuple[int, _Visibility | None, _View | None]:
         done, (i, c, camera) = one
         disputed = counted = None
         if (shared := reference_views[i]) is not None:
@@ -281,12 +281,12 @@ def _best_views(
     return [todo[row] for row in sorted(chosen)]
 
 
-def _count(seen: Rendering, disputed: np.ndarray | None) -> _Counted:
+def _count(seen: Rendering, disputed: np.ndarray | None) -> _Visibility:
     dominant = seen.dominant_id[0]
     pixels = sure = np.bincount(dominant[dominant >= 0], minlength=len(seen.max_weight))
     if disputed is not None:
         sure = np.bincount(dominant[(dominant >= 0) & ~disputed], minlength=len(pixels))
-    return _Counted(pixels, sure, seen.max_weight)
+    return _Visibility(pixels, sure, seen.max_weight)
 
 
 def _coarse_points(camera: Cameras, depth: np.ndarray) -> np.ndarray:
