@@ -110,6 +110,8 @@ def describe(
     Raises:
         ConfigError: the policy, segmenter or embedder is unknown, or a method lacks its model.
     """
+    from gsmap.geometry.threads import run_aside  # imported here, as the recipe key does not need it
+
     params, gaussians = params or Params(), gaussians.degree_0()
     if scale_policy not in SCALE_POLICIES:
         raise ConfigError(
@@ -132,21 +134,21 @@ def describe(
         notes.append(
             "the vertical is unknown (no cameras that turn about it, no clear floor): landmarks are matched without it"
         )
-    if params.landmarks:
-        layers |= _landmark_layers(cloud, up, units, params.landmark, progress)
-    if params.objects:
-        seen_m = working_m if scale_policy == "known" else guess_m
-        context = SceneContext(cloud, len(gaussians), up, seen_m, models or {})
-        layers["objects"], remarks = object_layer(
-            gaussians, cameras, context, params.object, lambda fraction, text: progress(0.6 + 0.35 * fraction, text)
-        )
-        notes += remarks
+    segments_unit_m = 1.0 if "landmarks" in units else unit_m
+    with run_aside(lambda: find_segments(gaussians, cloud, up, segments_unit_m) if params.things else None) as segments:
+        if params.landmarks:
+            layers |= _landmark_layers(cloud, up, units, params.landmark, progress)
+        if params.objects:
+            seen_m = working_m if scale_policy == "known" else guess_m
+            context = SceneContext(cloud, len(gaussians), up, seen_m, models or {})
+            layers["objects"], remarks = object_layer(
+                gaussians, cameras, context, params.object, lambda fraction, text: progress(0.6 + 0.35 * fraction, text)
+            )
+            notes += remarks
+        progress(0.95, "segments")
+        found = segments()
     if len(cloud) and not any(len(layer) >= _FEW_NODES for layer in layers.values()):
         notes.append(f"fewer than {_FEW_NODES} nodes in every layer: too little colour or shape for registration")
-    found = None
-    if params.things:
-        progress(0.95, "segments")
-        found = find_segments(gaussians, cloud, up, 1.0 if "landmarks" in units else unit_m)
     progress(1.0, "described")
     graph = SceneGraph(scene_id, layers, up, unit_m, tuple(notes), found, working_m)
     return round_graph(graph)
@@ -156,13 +158,16 @@ def _landmark_layers(
     cloud: PointCloud, up: np.ndarray | None, units: Mapping[str, float], params: LandmarkParams, progress: Progress
 ) -> dict[str, NodeLayer]:
     """Return the landmark layers by name, at the metres per unit (`landmark_units`) that each assumes."""
-    octaves, layers = OctaveCache(), dict[str, NodeLayer]()
+    from gsmap.geometry.threads import map_ahead  # imported here, as the recipe key does not need it
+
+    octaves = OctaveCache()
     find_extrema(cloud, up, units.values(), params, octaves)
-    for i, (name, unit_m) in enumerate(units.items()):
-        progress(0.05 + 0.55 * i / len(units), name)
-        layers[name] = landmark_layer(cloud, up, unit_m, params, octaves)
+    layers, free = dict[str, NodeLayer](), dict[str, NodeLayer]()
+    found = map_ahead(lambda unit_m: landmark_layer(cloud, up, unit_m, params, octaves), units.values())
+    for i, (name, layer) in enumerate(zip(units, found, strict=True)):
+        progress(0.05 + 0.55 * (i + 1) / len(units), name)
+        layers[name] = layer
     if up is not None:
         for name in [name for name in units if ":" not in name] or ["landmarks:1"]:
-            free = name.replace("landmarks", "landmarks_gravity_free")
-            layers[free] = gravity_free(layers[name], cloud, params)
-    return layers
+            free[name.replace("landmarks", "landmarks_gravity_free")] = gravity_free(layers[name], cloud, params)
+    return layers | free

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -36,3 +37,16 @@ def map_ahead(
             yield pending.popleft().result()
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+@contextlib.contextmanager
+def run_aside(function: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
+    """Run a function on a thread of its own; the context is a function that waits for the result.
+
+    With one thread, the function runs when its result is asked for.
+    """
+    if num_threads() == 1:
+        yield function
+        return
+    with ThreadPoolExecutor(1) as pool:
+        yield pool.submit(function).result

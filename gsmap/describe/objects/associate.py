@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -11,15 +12,18 @@ from gsmap.describe.cloud import downsample
 
 @dataclass(eq=False)
 class Node:
-    """An object under construction: points (n, 3), their box (2, 3), a unit feature (F,), and the views that show
-    it."""
+    """An object under construction: points (n, 3), a unit feature (F,), and the views that show it."""
 
     points: np.ndarray
-    box: np.ndarray
     feature: np.ndarray
     confidences: list[float] = field(default_factory=list)
     views: set[int] = field(default_factory=set)
     part: int | None = None
+
+    @cached_property
+    def box(self) -> np.ndarray:
+        """(2, 3) box of the points; see `box_of`."""
+        return box_of(self.points)
 
 
 def associate(nodes: list[Node], region: Node, tau: float, cell: float) -> Node:
@@ -35,7 +39,7 @@ def associate(nodes: list[Node], region: Node, tau: float, cell: float) -> Node:
         return region
     united = np.concatenate([best.points, region.points])
     best.points = downsample(united, united, cell)[0]
-    best.box = box_of(best.points)
+    best.__dict__.pop("box", None)
     seen = len(best.confidences)
     mean = (best.feature * seen + region.feature) / (seen + 1)
     best.feature = mean / max(np.linalg.norm(mean), 1e-12)
@@ -48,8 +52,7 @@ def make_region(
     points: np.ndarray, feature: np.ndarray, confidence: float, view: int, cell: float, part: int | None = None
 ) -> Node:
     """Return one mask as a node of its own."""
-    points = downsample(points, points, cell)[0]
-    return Node(points, box_of(points), feature, [confidence], {view}, part)
+    return Node(downsample(points, points, cell)[0], feature, [confidence], {view}, part)
 
 
 def _counterpart(nodes: list[Node], region: Node, tau: float) -> Node | None:
