@@ -330,6 +330,7 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
         _photos(store, placed, living),
         revision=store.revisions.newest_number(),
         metres_per_unit={component: metre.metres_per_unit for component, metre in metres.items()},
+        scale_sigma={component: metre.sigma for component, metre in metres.items() if not metre.is_rough},
         merged=merged,
         has_objects=placed is not None and bool(graphs),
         stale=bool(given.scenes) and (newest is None or newest.key != given.key.digest),

@@ -154,6 +154,7 @@ class ViewMap:
         state: Opaque text that differs after every change of the map.
         revision: Revision of the poses; None before the first.
         metres_per_unit: Metres per map unit of each component.
+        scale_sigma: Standard deviation of its logarithm; a component of unknown scale is missing.
         merged: Components with merged tiles.
         has_objects: The map has objects.
         stale: The poses are outdated, because edges or priors changed after the revision.
@@ -168,6 +169,7 @@ class ViewMap:
     state: str = ""
     revision: int | None = None
     metres_per_unit: Mapping[int, float] = field(default_factory=dict)
+    scale_sigma: Mapping[int, float] = field(default_factory=dict)
     merged: frozenset[int] = frozenset()
     has_objects: bool = False
     stale: bool = False
@@ -263,6 +265,7 @@ def summary(view: ViewMap, served: ServerState) -> dict[str, Any]:
                 "num_scenes": len(members[component]),
                 "up": up_of([view.scenes[i] for i in members[component]]),
                 "metres_per_unit": view.metres_per_unit.get(component, 1.0),
+                "scale_sigma": view.scale_sigma.get(component),
                 "box": _box(served.overviews.get(component), [corners[i] for i in members[component]]).tolist(),
                 "plan": f"plans/{component}.json" if served.live and view.revision is not None else None,
                 "overview": _overview(served.overviews.get(component)),

@@ -89,6 +89,7 @@ def made_map(scenes: int = 12, second_island: int = 2, hostile: bool = False) ->
                 "num_scenes": (scenes, second_island)[k],
                 "up": [0, 0, 1],
                 "metres_per_unit": (1.0, 0.5)[k],
+                "scale_sigma": (0.01, None)[k],
                 "box": [[-1, -1, 0], [3.0 * (scenes, second_island)[k] - 2, 1, 2]],
                 "overview": {
                     "uri": f"overviews/{k}/none.spz",

@@ -96,6 +96,7 @@ def site(
     (folder / "overview.spz").write_bytes(spz.pack("overview", Gaussians.concatenate(shares)))
     every = np.concatenate(corners)
     component = {"component": 0, "num_scenes": len(rows), "up": [0, -1, 0], "metres_per_unit": 1.0,
+                 "scale_sigma": None,
                  "box": [every.min(0).tolist(), every.max(0).tolist()], "merged": None,
                  "plan": None,
                  "overview": {"uri": "overview.spz", "pending": 0, "scenes": list(range(len(rows))), "counts": counts,

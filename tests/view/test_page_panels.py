@@ -432,20 +432,32 @@ def test_a_picked_place_tells_its_history_and_picked_things_are_chosen(hands):
     assert hands.value("findAll('gs-place .card').length") == 0
 
 
-def test_a_length_is_measured_between_two_picked_places(hands):
-    pick = "fake.pick({point: [%s], scene: null, thing: null})"
+def test_the_ruler_stays_taken_and_two_clicks_are_a_length(hands):
+    def pick(point: str, scene: int = 1) -> None:
+        hands.value(f"fake.pick({{point: [{point}], pixel: 0.03, scene: {scene}, thing: null}})")
+
+    ruler = "find('button', 'Measure a length').getAttribute('aria-pressed')"
     hands.click("button", "Measure a length")
-    hands.says("Click the first end", "gs-notices")
-    hands.value(pick % "1, 0, 0.5")
-    hands.says("1.00, 0.00, 0.50 m", "gs-place")
-    hands.press("m")
+    hands.says("Click one end", "gs-place")
+    assert told(hands, "setRuler") == [True]
+    pick("1, 0, 0.5")
     hands.says("Click the other end", "gs-place")
-    hands.value(pick % "4, 4, 2.5")
-    hands.says("5.39 m", "gs-place")
-    assert "height 2.00 m" in hands.text("gs-place")
-    assert "level 5.00 m" in hands.text("gs-place")
+    pick("4, 4, 2.5")
+    hands.says("5.00 m across, 2.00 m up, 5.39 m straight", "gs-place")
+    hands.says("± 6.9 cm", "gs-place")  # hypot(0.03, 0.03, 0.01 * 5.39)
+    assert hands.value("findAll('gs-place strong').length") == 0, "no length of the three stands out"
+    assert hands.value(ruler) == "true"
     assert told(hands, "setMeasure") == [[[1, 0, 0.5], [4, 4, 2.5]]]
+    hands.value("document.getElementById('canvas').dispatchEvent(new Event('drawn'))")
+    hands.wait("find('button', 'Walk in')")
+    card = hands.value("find('.card', 'straight').getBoundingClientRect().bottom")
+    assert hands.value("find('button', 'Walk in').getBoundingClientRect().top") > card
+    pick("0, 0, 1")
+    pick("2, 0, 1", scene=2)
+    hands.wait("find('strong', '2.00 m across')")
     hands.press("Escape")
+    assert hands.value(ruler) == "false"
+    assert told(hands, "setRuler") == [False]
     assert hands.value("findAll('gs-place .card').length") == 0
 
 

@@ -63,6 +63,7 @@ export async function createStage(options: StageOptions): Promise<Stage> {
     setGraph: note("setGraph"),
     setHighlighted: note("setHighlighted"),
     setMeasure: note("setMeasure"),
+    setRuler: note("setRuler"),
     setChanges: (changes) => calls.push(["setChanges", changes.map((one) => one.id)]),
     setCorrespondences: (detail) => calls.push(["setCorrespondences", detail?.correspondences.length ?? null]),
     setPoses: (revision) => calls.push(["setPoses", revision?.id ?? null]),

@@ -111,7 +111,7 @@ export function showComponent(component: number): void {
     clip: null,
     until: null,
     pick: null,
-    measureFrom: null,
+    ruler: null,
     drag: null,
     standpoint: null,
   });
@@ -327,14 +327,18 @@ export function flyToSelected(selection = page.state.selection): void {
 /** So much around a thing that one sees where it stands. */
 const grown = (box: Box) => shrunk(box, 3);
 
-/** A click in the 3D view: on a thing chooses it, anywhere else tells the place. */
+/** A click in the 3D view: an end for the ruler; else on a thing chooses it, anywhere else tells the place. */
 export function picked(pick: Pick): void {
-  const { map } = page.state;
+  const { map, ruler } = page.state;
   const { thing } = pick;
+  if (ruler) {
+    page.set({ ruler: ruler.length === 1 ? [...ruler, pick] : [pick] });
+    return;
+  }
   page.set({ pick });
   if (!map) return;
   if (!thing) {
-    const object = page.state.tab === "things" && page.state.measureFrom === null ? objectAt(pick.point) : undefined;
+    const object = page.state.tab === "things" ? objectAt(pick.point) : undefined;
     if (object) select({ kind: "object", key: object.id }, false);
     return;
   }
@@ -359,12 +363,10 @@ function objectAt(point: Vector) {
     .sort((a, b) => size(a.box) - size(b.box))[0];
 }
 
-/** Measures from the place that was picked to the next one; again: ends it. */
-export function measure(): void {
-  const { pick, measureFrom } = page.state;
-  if (measureFrom) page.set({ measureFrom: null, pick: null });
-  else if (pick) page.set({ measureFrom: pick.point, pick: null });
-  else say("Click the first end of the length in the 3D view, then “Measure from here” (m)");
+/** Takes the ruler: the next two clicks are the ends of a length. Puts it away where it was taken. */
+export function measure(from?: Pick): void {
+  if (page.state.ruler) page.set({ ruler: null });
+  else page.set({ ruler: from ? [from] : [], pick: null });
 }
 
 export const hover = (object: string | null) => {

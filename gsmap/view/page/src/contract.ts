@@ -38,6 +38,7 @@ export interface Component {
   num_scenes: number;
   up: Vector; // against gravity
   metres_per_unit: number;
+  scale_sigma: number | null; // standard deviation of its logarithm; null if the scale is not known
   box: Box; // of what its scenes show, without floaters; map frame
   plan: string | null; // GET: FloorPlan; null in a static page and before the first optimize
   overview: Overview | null; // every scene of it, coarsely, in one file

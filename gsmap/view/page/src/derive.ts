@@ -1,5 +1,6 @@
 // What follows from the state: which scenes are seen, which edges are listed. Pure functions.
 import type { ChangeEntry, Component, EdgeEntry, MapSummary, PhotoEntry, RevisionPoses, SceneEntry } from "./contract";
+import type { Pick } from "./stage/stage";
 import type { EdgeFilter, Selection, Side, State } from "./state";
 
 export const edgeKey = (map: MapSummary, edge: EdgeEntry) =>
@@ -107,6 +108,30 @@ export function listedChanges(state: State): ChangeEntry[] {
   return (map?.changes ?? [])
     .filter((one) => one.component === component && isBy(one.at, until) && shown(one))
     .sort((a, b) => (b.at ?? "").localeCompare(a.at ?? "") || b.confidence - a.confidence);
+}
+
+export interface Length {
+  across: number;
+  up: number; // negative where the second end is lower
+  straight: number;
+  sigma: number | null; // standard deviation of the straight length; null where the map's scale is not known
+}
+
+/** A length between two picked places, in metres: as sure as the picks, the poses of their scenes and the scale. */
+export function lengthOf(map: MapSummary, component: Component, from: Pick, to: Pick): Length {
+  const { up, metres_per_unit: unit, scale_sigma: scale } = component;
+  const off = from.point.map((v, i) => (to.point[i] ?? v) - v);
+  const high = off.reduce((sum, v, i) => sum + v * (up[i] ?? 0), 0);
+  const whole = Math.hypot(...off);
+  const poseOf = ({ scene }: Pick) => (scene === null ? 0 : (map.scenes[scene]?.sigma_m ?? 0));
+  const poses = from.scene === to.scene ? [] : [poseOf(from), poseOf(to)];
+  const parts = [from.pixel * unit, to.pixel * unit, whole * unit * (scale ?? 0), ...poses];
+  return {
+    across: Math.sqrt(Math.max(0, whole ** 2 - high ** 2)) * unit,
+    up: high * unit,
+    straight: whole * unit,
+    sigma: scale === null ? null : Math.hypot(...parts),
+  };
 }
 
 /** How an edge stands, in one word of the map's. */

@@ -83,6 +83,10 @@ export function drive(stage: Stage): () => void {
   });
   const highlighted = new StageCall<ReadonlySet<string>>(sameSet, (ids) => stage.setHighlighted(ids));
   const measured = new StageCall<readonly Vector[]>(alike, (points) => stage.setMeasure(points));
+  const ruler = new StageCall<boolean>(is, (taken) => {
+    stage.setRuler(taken);
+    document.documentElement.toggleAttribute("data-ruler", taken);
+  });
   const theme = new StageCall<boolean>(is, (dark) => stage.setTheme(dark));
   let things: unknown = null;
 
@@ -121,7 +125,8 @@ export function drive(stage: Stage): () => void {
     detail.now(detailOf(state));
     const chosen = state.selection?.kind === "object" ? state.selection.key : null;
     highlighted.now(new Set([chosen, state.hovered].flatMap((id) => id ?? [])));
-    measured.now([state.measureFrom, state.pick?.point].flatMap((at) => (at ? [at] : [])));
+    measured.now((state.ruler ?? [state.pick]).flatMap((pick) => (pick?.point ? [pick.point] : [])));
+    ruler.now(state.ruler !== null);
     dragging.now(state.drag?.scene ?? null);
     for (const aim of actions.takeAims()) aim();
   };

@@ -57,7 +57,7 @@ function findBox(): void {
 function escape(): void {
   const { state } = page;
   if (state.drag) actions.endDrag();
-  else if (state.measureFrom) actions.measure();
+  else if (state.ruler) actions.measure();
   else if (state.pick) page.set({ pick: null });
   else if (state.selection) actions.select(null);
 }
@@ -90,7 +90,7 @@ export const KEYS: readonly Key[] = [
   { key: ".", what: "Next camera", group: "Review", press: () => actions.view(1, views()) },
   { key: "f", what: "Fit all in view", group: "View", press: actions.fit },
   { key: "i", what: "Walk in", group: "View", press: () => void actions.walkIn() },
-  { key: "m", what: "Measure from the place that was clicked", group: "View", press: actions.measure },
+  { key: "m", what: "Measure a length: two clicks", group: "View", press: () => actions.measure() },
   { key: "g", what: "Fly to what is chosen", group: "View", press: () => actions.flyToSelected() },
   { key: "h", what: "Doll’s house: no ceiling", group: "View", press: () => actions.ceiling() },
   { key: "x", what: "Clip box", group: "View", press: () => actions.clip() },

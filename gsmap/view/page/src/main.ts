@@ -14,7 +14,7 @@ function restore(hash: string): void {
   const { map } = page.state;
   if (!map) return;
   const shared = address.read(hash, map);
-  page.set({ ...shared, side: "left", drag: null, pick: null, measureFrom: null });
+  page.set({ ...shared, side: "left", drag: null, pick: null, ruler: null });
   const { standpoint } = shared;
   actions.aim(() => (standpoint ? page.stage?.stand(standpoint) : page.stage?.fit(undefined, false)));
 }

@@ -1,6 +1,6 @@
 // What the page shows, in one value. Elements read it, actions change it, and whoever shows a part of it is told.
 // Scenes, pairs and changes are named by their ids, so a map that others changed meanwhile keeps what was chosen.
-import type { Box, MapSummary, Matrix, Vector } from "./contract";
+import type { Box, MapSummary, Matrix } from "./contract";
 import type { Pick, Source, Stage, Standpoint } from "./stage/stage";
 
 export const TABS = ["look", "review", "time", "things"] as const;
@@ -84,7 +84,7 @@ export interface State {
   until: string | null; // only scenes captured until then
   revision: number | null; // null: the newest
   pick: Pick | null;
-  measureFrom: Vector | null; // the first end of a measured length, map frame; the second is picked
+  ruler: readonly Pick[] | null; // ends of the measured length that are set: none, one or both; null: put away
   hovered: string | null; // id of the object in the list that the pointer is on
   drag: Drag | null;
   standpoint: Standpoint | null;
@@ -123,7 +123,7 @@ export function initial(): State {
     until: null,
     revision: null,
     pick: null,
-    measureFrom: null,
+    ruler: null,
     hovered: null,
     drag: null,
     standpoint: null,

@@ -151,7 +151,7 @@ export class App extends Panel {
         position: absolute;
         left: 12px;
         right: 12px;
-        bottom: 12px;
+        bottom: calc(var(--target) + 24px); /* above the way in and out */
         display: grid;
         justify-items: center;
         gap: 8px;

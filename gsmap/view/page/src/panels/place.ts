@@ -4,12 +4,15 @@ import { customElement, state } from "lit/decorators.js";
 import * as actions from "../actions";
 import * as derive from "../derive";
 import { page } from "../state";
-import type { Component, PlaceHistory, Vector } from "../contract";
+import type { Component, MapSummary, PlaceHistory } from "../contract";
+import type { Pick } from "../stage/stage";
 import { day, metres, point } from "../words";
 import { Panel } from "./base";
 import { shared } from "./css";
 import { icon } from "./icons";
 import { waiting } from "./waiting";
+
+const LEVEL = 0.05; // of a length: what its ends may differ in height for it to be called level
 
 @customElement("gs-place")
 export class Place extends Panel {
@@ -53,12 +56,12 @@ export class Place extends Panel {
   @state() private asked: string | null = null; // the place whose history was asked for
 
   protected override render() {
-    const { map, pick, component, measureFrom } = this.state;
+    const { map, pick, component, ruler } = this.state;
     const shown = map && derive.componentOf(map, component);
-    if (!map || !shown || (!pick && !measureFrom)) return nothing;
-    const unit = shown.metres_per_unit;
-    if (measureFrom) return this.measure(measureFrom, pick?.point ?? null, shown);
+    if (!map || !shown) return nothing;
+    if (ruler) return this.measure(ruler, map, shown);
     if (!pick) return nothing;
+    const unit = shown.metres_per_unit;
     const scene = pick.scene === null ? undefined : map.scenes[pick.scene];
     const key = `${component} ${pick.point.map((v) => v.toFixed(4)).join(",")}`;
     const isAsked = this.asked === key;
@@ -79,9 +82,7 @@ export class Place extends Panel {
                 ${icon("clock")} What happened here
               </button>`
         }
-        <button class="plain" title="Measure from here (m)" @click=${actions.measure}>
-          ${icon("ruler")} Measure from here
-        </button>
+        <button class="plain" @click=${() => actions.measure(pick)}>${icon("ruler")} Measure from here</button>
         <button class="plain square" aria-label="Close" @click=${() => page.set({ pick: null })}>
           ${icon("close")}
         </button>
@@ -99,27 +100,40 @@ export class Place extends Panel {
     </div>`;
   }
 
-  private measure(from: Vector, to: Vector | null, { up, metres_per_unit: unit }: Component) {
-    const off = to ? from.map((v, i) => (to[i] ?? v) - v) : [];
-    const high = Math.abs(off.reduce((sum, v, i) => sum + v * (up[i] ?? 0), 0));
-    const whole = Math.hypot(...off);
+  private measure([from, to]: readonly Pick[], map: MapSummary, component: Component) {
     return html`<div class="card" role="group" aria-label="A length">
       <div class="row">
         ${
-          to
-            ? html`<strong class="figures" role="status">${metres(whole * unit)}</strong>
-                <span class="figures muted">height ${metres(high * unit)}</span>
-                <span class="figures muted"
-                  >level ${metres(Math.sqrt(Math.max(0, whole ** 2 - high ** 2)) * unit)}</span
-                >
-                <span class="figures muted">${point(from, unit)} to ${point(to, unit)}</span>`
-            : html`<span role="status">Click the other end of the length</span>`
+          from && to
+            ? html`<span class="figures" role="status">${this.length(derive.lengthOf(map, component, from, to))}</span>
+                <span class="muted">Click for another length</span>`
+            : html`<span role="status">Click ${from ? "the other end" : "one end"} of the length in the 3D view</span>`
         }
-        <button class="plain square" aria-label="End measuring" title="End measuring (Esc)" @click=${actions.measure}>
+        <button
+          class="plain square"
+          aria-label="End measuring"
+          title="End measuring (Esc)"
+          @click=${() => actions.measure()}
+        >
           ${icon("close")}
         </button>
       </div>
     </div>`;
+  }
+
+  /** One number where the ends are at one height or one above the other; else all three, none before the others. */
+  private length({ across, up, straight, sigma }: derive.Length) {
+    const known =
+      sigma === null
+        ? html` <span class="muted">the map's scale is not known</span>`
+        : html` <span class="muted" title="Standard deviation, by the picked pixels, the poses and the scale"
+            >± ${metres(sigma)}</span
+          >`;
+    const [level, upright] = [`${metres(across)} across`, `${metres(Math.abs(up))} ${up < 0 ? "down" : "up"}`];
+    const least = LEVEL * straight;
+    if (Math.abs(up) <= least) return html`<strong>${level}</strong>${known}`;
+    if (across <= least) return html`<strong>${upright}</strong>${known}`;
+    return html`${level}, ${upright}, ${metres(straight)} straight${known}`;
   }
 
   private history({ rows }: PlaceHistory) {

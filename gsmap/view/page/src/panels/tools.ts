@@ -43,7 +43,7 @@ export class Tools extends Panel {
       <div role="toolbar" aria-label="View" aria-orientation="vertical" @keydown=${this.arrows}>
         ${this.button("fit", "Fit all in view", "f", actions.fit)}
         ${this.button("house", "Doll’s house: no ceiling", "h", () => actions.ceiling(), !state.ceiling)}
-        ${this.button("ruler", "Measure a length", "m", actions.measure, state.measureFrom !== null)}
+        ${this.button("ruler", "Measure a length", "m", () => actions.measure(), state.ruler !== null)}
         ${this.button("clip", "Clip box", "x", () => actions.clip(), state.clip !== null)}
         ${this.button("split", "Split view", "v", () => actions.split(), state.split !== null)}
       </div>

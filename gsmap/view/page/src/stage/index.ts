@@ -86,6 +86,7 @@ class View3D implements Stage {
   private graph: GraphEntry = { objects: [], relations: [], rooms: [] };
   private highlighted: ReadonlySet<string> = new Set();
   private measured: readonly Vector[] = [];
+  private isRulerTaken = false;
   private changes: ChangeEntry[] = [];
   private detail: EdgeDetail | null = null;
   private readonly extras = new Map<string, Promise<SceneExtras | null>>(); // by address, asked for once
@@ -199,6 +200,10 @@ class View3D implements Stage {
   setMeasure(points: readonly Vector[]): void {
     this.measured = points;
     this.drawOverlays();
+  }
+
+  setRuler(taken: boolean): void {
+    this.isRulerTaken = taken;
   }
 
   setChanges(changes: ChangeEntry[]): void {
@@ -713,8 +718,13 @@ class View3D implements Stage {
     const rect = canvas.getBoundingClientRect();
     const [x, y] = [event.clientX - rect.left, event.clientY - rect.top];
     const { camera } = this.view;
-    const line = this.overlays.pick(camera, x, y, rect.width, rect.height);
-    if (line) return { point: line.point.toArray(), scene: line.lines.scene ?? null, thing: line.lines.thing ?? null };
+    const line = this.isRulerTaken ? null : this.overlays.pick(camera, x, y, rect.width, rect.height);
+    const pixelAt = (depth: number) => (2 * depth) / ((camera.projectionMatrix.elements[5] ?? 1) * rect.height);
+    if (line) {
+      const depth = -line.point.clone().applyMatrix4(camera.matrixWorldInverse).z;
+      const { scene = null, thing = null } = line.lines;
+      return { point: line.point.toArray(), pixel: pixelAt(depth), scene, thing };
+    }
     const k = canvas.width / rect.width;
     const hit = this.splatRenderer.pick(camera, Math.floor(x * k), Math.floor(y * k), canvas.width, canvas.height);
     if (!hit) return null;
@@ -726,7 +736,7 @@ class View3D implements Stage {
     const point = ray.ray.origin.clone().addScaledVector(ray.ray.direction, distance);
     const owner = this.splatRenderer.owner(hit.splat);
     const scene = owner && this.loader ? this.loader.sceneOf(owner.tile, owner.index) : -1;
-    return { point: point.toArray(), scene: scene >= 0 ? scene : null, thing: null };
+    return { point: point.toArray(), pixel: pixelAt(hit.depth), scene: scene >= 0 ? scene : null, thing: null };
   }
 
   // ---- dragging a scene -------------------------------------------------------------------------------------------

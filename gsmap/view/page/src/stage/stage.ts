@@ -13,6 +13,7 @@ export interface Standpoint {
 /** What is picked: the nearest surface under the pointer. */
 export interface Pick {
   point: Vector; // map frame
+  pixel: number; // width of a pixel there, map units
   scene: number | null;
   thing: { kind: "edge" | "change" | "object" | "photo" | "camera"; index: number } | null;
 }
@@ -59,6 +60,8 @@ export interface Stage {
   setHighlighted(objects: ReadonlySet<string>): void;
   /** A length that is measured, or a place that was picked. */
   setMeasure(points: readonly Vector[]): void;
+  /** While a length is measured, lines are not picked: its ends are on surfaces. */
+  setRuler(taken: boolean): void;
   setChanges(changes: ChangeEntry[]): void; // boxes coloured by kind
   setCorrespondences(detail: EdgeDetail | null): void;
   /** Poses of an old revision in place of the newest ones; null goes back. */
