@@ -37,10 +37,7 @@ def find_sides(points: np.ndarray, normals: np.ndarray, tree: Any, views: ViewCa
         unknown, because no camera saw the cell, or cameras saw it from both sides (objects thinner than a cell).
     """
     front, back = _weights_of_sides(points, normals, views, unit_m)
-    side = _sides(front, back)
-    for _ in range(_FILL_ROUNDS):
-        side = _fill_unknown(side, points, normals, tree)
-    return side
+    return _fill_unknown(_sides(front, back), points, normals, tree)
 
 
 def _weights_of_sides(
@@ -73,7 +70,7 @@ def _sides(front: np.ndarray, back: np.ndarray) -> np.ndarray:
 
 
 def _fill_unknown(side: np.ndarray, points: np.ndarray, normals: np.ndarray, tree: Any) -> np.ndarray:
-    """Return the (M,) sides; cells of unknown side take the side of their coplanar neighbours."""
+    """Return the (M,) sides; cells of unknown side take the side of their coplanar neighbours, in a few rounds."""
     unknown = np.flatnonzero(side == 0)
     if not len(unknown) or len(unknown) == len(side):
         return side
@@ -83,7 +80,11 @@ def _fill_unknown(side: np.ndarray, points: np.ndarray, normals: np.ndarray, tre
     along = (normals[near] * normals[unknown][:, None]).sum(2)
     rise = ((points[near] - points[unknown][:, None]) * normals[unknown][:, None]).sum(2)
     coplanar = there & (np.abs(along) > _MIN_COPLANAR_COSINE) & (np.abs(rise) < _MAX_COPLANAR_M)
-    votes = np.where(coplanar, side[near] * np.sign(along), 0.0)
-    out = side.copy()
-    out[unknown] = _sides((votes > 0).sum(1), (votes < 0).sum(1))
-    return out
+    same = coplanar * np.sign(along)
+    for _ in range(_FILL_ROUNDS):
+        votes = side[near] * same
+        known = side[unknown]
+        filled = _sides((votes > 0).sum(1), (votes < 0).sum(1))
+        side = side.copy()
+        side[unknown] = np.where(known == 0, filled, known)
+    return side

@@ -34,12 +34,10 @@ class PointCloud:
     def evenly(self, count: int) -> PointCloud:
         """Return every n-th point, at most ``count``, with the area of each point multiplied by n."""
         step = -(-len(self) // count)
-        rows = slice(None, None, step)
-        return (
-            self
-            if step <= 1
-            else PointCloud(self.points[rows], self.lab[rows], step * self.areas[rows], self.index[rows])
-        )
+        if step <= 1:
+            return self
+        rows = np.arange(0, len(self), step)
+        return PointCloud(self.points[rows], self.lab[rows], step * self.areas[rows], self.index[rows])
 
 
 @dataclass(frozen=True, eq=False)

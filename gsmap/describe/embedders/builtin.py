@@ -97,9 +97,10 @@ class BuiltinEmbedder:
         values, axes = np.linalg.eigh(np.cov((points * self.unit_m).T) + 1e-8 * np.eye(3))
         spread = np.sqrt(values)
         tilt = 0.5 if self.up is None else abs(float(axes[:, 0] @ self.up))
-        ratios = [spread[0] / spread[2], spread[1] / spread[2], tilt]
-        size = _soft(np.log(4 * spread[2:]), _SIZE)
-        return np.concatenate([size, *[_soft(np.array([r]), _RATIO) for r in ratios]])
+        ratio = _soft_bins(np.array([spread[0] / spread[2], spread[1] / spread[2], tilt]), _RATIO)
+        ratios, rows = np.zeros((3, ratio.size)), np.arange(3)
+        ratios[rows, ratio.low], ratios[rows, ratio.high] = ratio.low_share, ratio.high_share
+        return np.concatenate([_soft_bins(np.log(4 * spread[2:]), _SIZE).of(slice(None)), ratios.ravel()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,11 +134,6 @@ def _soft_bins(values: np.ndarray, centres: np.ndarray) -> _SoftBins:
     low = np.minimum(at.astype(int), len(centres) - 2)
     share = at - low
     return _SoftBins(low, low + 1, 1 - share, share, len(centres))
-
-
-def _soft(values: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Compute the histogram of values over evenly spaced centres."""
-    return _soft_bins(values, centres).of(slice(None))
 
 
 def _hues(lab: np.ndarray) -> _SoftBins:

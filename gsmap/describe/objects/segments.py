@@ -69,6 +69,7 @@ def find_segments(gaussians: Gaussians, cloud: PointCloud, up: np.ndarray | None
     colours = srgb_to_lab(np.clip(rgb_of_sh0(gaussians.sh[rows, 0]), 0.0, 1.0))
     order = np.argsort(of, kind="stable")
     parts = np.split(order, np.searchsorted(of[order], np.arange(1, count))) if count else []
+    ordered, starts = means[order], np.searchsorted(of[order], np.arange(count))
     # One sample per cell suffices for the shape of a segment.
     cells = np.floor(means * unit_m / _SAMPLE_M).astype(np.int64)
     labels, counts = cell_labels(np.column_stack([of, cell_labels(cells)[0], np.zeros(len(rows), np.int64)]))
@@ -76,8 +77,8 @@ def find_segments(gaussians: Gaussians, cloud: PointCloud, up: np.ndarray | None
     of_cell[labels] = of
     return Segments(
         members,
-        np.array([means[p].mean(0) for p in parts]).reshape(-1, 3),
-        np.array([[means[p].min(0), means[p].max(0)] for p in parts]).reshape(-1, 2, 3),
+        group_means(means, of, np.bincount(of, minlength=count)),
+        np.stack([bound.reduceat(ordered, starts) if count else ordered for bound in (np.minimum, np.maximum)], axis=1),
         np.array([np.median(colours[p], axis=0) for p in parts]).reshape(-1, 3),
         group_means(means, labels, counts),
         group_means(colours.astype(np.float64), labels, counts),
