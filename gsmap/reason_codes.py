@@ -93,6 +93,7 @@ ERRORS: Final[Mapping[str, str]] = {
     "not_a_plain_file": "A link, pipe, device or folder was found in place of a plain file.",
     "not_json": "A file is not valid JSON, or not of the structure expected.",
     "not_writable": "The file, folder, tag or map opened for reading cannot be written.",
+    "own_export": "A file was exported from scenes of the map that it was given to.",
     "target_is_a_folder": "The output must be a file, but it is a folder.",
     "too_many_open_files": "The process has too many files open.",
     # Captures, and files of Gaussians, cameras and poses.
@@ -416,7 +417,7 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
     "too_few_edges": ("Too few agreeing edges join two large components.", r"would join two (components|islands)"),
     "unconfirmed": (
         "No cycle of edges confirms the edge.",
-        r"in no agreeing cycle|ties two islands that nothing else joins|the only tie to the rest",
+        r"in no agreeing cycle|repeats another edge|ties two islands that nothing else joins|the only tie to the rest",
     ),
     # World observations.
     "contradicts_observations": (

@@ -18,8 +18,10 @@ from gsmap.optimize.component_growth import (
     close_loops_through_single_edges,
     cut_weak_bridges,
 )
+from gsmap.optimize.consistency import consistent_with_component
 from gsmap.optimize.contradictions import CONTRADICTION_GATES, exclude_contradicted, find_contested_edges
 from gsmap.optimize.cycles import CycleSupport, count_cycle_support
+from gsmap.optimize.duplicates import find_repeated
 from gsmap.optimize.final_solve import solve_components
 from gsmap.optimize.fingerprint import fingerprint
 from gsmap.optimize.measurements import Measurements, all_rigid, check_priors, measurements
@@ -55,17 +57,14 @@ def solve_batch(
     gate = float(chi2_quantile(params.gate_probability, m.dim))
 
     terms = PriorTerms.stack(m.scene_ids, priors)
-    doubtful = find_doubtful(m, params.max_disagreement)
-    state, cycles = _grown_from(m, ~doubtful, terms, gate, params, progress)
-    if (m.disagreement > 0).any() and not state.accepted.all():
-        stricter = find_doubtful_in_map(m, state, doubtful, gate, params)
-        if (stricter & ~doubtful).any():
-            doubtful = stricter
-            state, cycles = _grown_from(m, ~doubtful, terms, gate, params, progress)
-    if doubtful.any():
-        # The map is built from undoubted edges; doubtful edges, which may join different places, are compared with it
-        # later.
-        accept_doubtful_edges(m, state, doubtful, gate, params)
+    repeated = find_repeated(m)
+    if repeated.any():
+        rows = np.flatnonzero(~repeated)
+        state, cycles = _robust(m[rows], terms, gate, params, progress)
+        state, cycles = state.spread(rows, len(m)), cycles.spread(rows, len(m))
+        _accept_repeated(m, state, repeated, gate, params)
+    else:
+        state, cycles = _robust(m, terms, gate, params, progress)
     _reconsider(m, state, gate)
     _check_confirmed(m, state, gate)
 
@@ -80,6 +79,32 @@ def solve_batch(
         notes=solved.notes,
         world=solved.world,
     )
+
+
+def _robust(
+    m: Measurements, terms: PriorTerms, gate: float, params: Params, progress: Progress
+) -> tuple[State, CycleSupport]:
+    """Solve robustly for the poses and the accepted edges, doubtful edges included."""
+    doubtful = find_doubtful(m, params.max_disagreement)
+    state, cycles = _grown_from(m, ~doubtful, terms, gate, params, progress)
+    if (m.disagreement > 0).any() and not state.accepted.all():
+        stricter = find_doubtful_in_map(m, state, doubtful, gate, params)
+        if (stricter & ~doubtful).any():
+            doubtful = stricter
+            state, cycles = _grown_from(m, ~doubtful, terms, gate, params, progress)
+    if doubtful.any():
+        # The map is built from undoubted edges; doubtful edges, which may join different places, are compared with it
+        # later.
+        accept_doubtful_edges(m, state, doubtful, gate, params)
+    return state, cycles
+
+
+def _accept_repeated(m: Measurements, state: State, repeated: np.ndarray, gate: float, params: Params) -> None:
+    """Accept the repeated edges that agree with the component of their scenes; they join no components."""
+    rows = np.flatnonzero(repeated)
+    fits = rows[consistent_with_component(m, rows, state.drift(m), params.gate_probability)]
+    state.accepted[fits] = True
+    refine(m, state, gate)
 
 
 def _grown_from(

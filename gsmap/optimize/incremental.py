@@ -40,9 +40,9 @@ def place_new(
     """Place the new scenes in the previous answer; return None where only a full solve is correct.
 
     A full solve is due if scenes, measurements between old scenes or the recipe changed; if the map grew by
-    ``params.max_growth`` since the last full solve; or if a new scene joins components, closes a long loop or has edges
-    that are doubtful or contradict each other. Poses placed here are provisional: only the neighbourhood of a new scene
-    is solved with it.
+    ``params.max_growth`` since the last full solve; or if a new scene joins components, closes a long loop, is near
+    duplicates or has edges that are doubtful or contradict each other. Poses placed here are provisional: only the
+    neighbourhood of a new scene is solved with it.
     """
     new = _to_place(scene_ids, previous, params)
     if not new or not {*survey.scenes(), *(prior.scene for prior in priors)} <= set(previous.poses):
@@ -132,7 +132,7 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
     poses = Similarities.stack([previous.poses[s].S_map_scene for s in near] + [Sim3.identity()])
     accepted = np.r_[np.ones(len(around), dtype=bool), m.confirmed[len(around) :]]
     own_edges = m[np.arange(len(around), len(m))]
-    if own_edges.confirmed.any() or find_doubtful(own_edges, params.max_disagreement).any():
+    if own_edges.confirmed.any() or m.duplicate.any() or find_doubtful(own_edges, params.max_disagreement).any():
         return None
     before = component_labels(m, np.flatnonzero(accepted))
     nothing = np.zeros(len(m), dtype=np.int64)

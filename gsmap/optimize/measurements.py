@@ -27,6 +27,7 @@ class Measurements:
         disagreement: (E,) share of the surface seen in both captures that differs; NaN if unknown.
         same_visit: (E,) mask of edges whose captures are of one visit, so that nothing changed between them.
         log_odds_wrong: (E,) log-odds by the evidence that the edge is wrong, up to a constant; NaN if unknown.
+        duplicate: (E,) mask of edges between two scenes made from one capture.
     """
 
     scene_ids: tuple[str, ...]
@@ -38,6 +39,7 @@ class Measurements:
     disagreement: np.ndarray
     same_visit: np.ndarray
     log_odds_wrong: np.ndarray
+    duplicate: np.ndarray
 
     @property
     def num_scenes(self) -> int:
@@ -73,6 +75,7 @@ class Measurements:
             self.disagreement[rows],
             self.same_visit[rows],
             self.log_odds_wrong[rows],
+            self.duplicate[rows],
         )
 
 
@@ -128,6 +131,7 @@ def measurements(scene_ids: Sequence[str], edges: Sequence[Edge], *, rigid: bool
         np.array([e.disagreement for e in edges], dtype=np.float64),
         np.array([e.same_visit for e in edges], dtype=bool),
         np.array([e.log_odds_wrong for e in edges], dtype=np.float64),
+        np.array([e.duplicate for e in edges], dtype=bool),
     )
 
 

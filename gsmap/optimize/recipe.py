@@ -9,8 +9,8 @@ from gsmap.optimize.params import Params
 from gsmap.types.plain import plain
 
 VERSIONS = {
-    "optimize": 5,
-    "optimize.incremental": 5,
+    "optimize": 6,
+    "optimize.incremental": 6,
     "perceptual_aliasing": 1,
     "gravity_align": 1,
     "keep_unchanged_poses": 1,

@@ -7,6 +7,7 @@ import numpy as np
 from gsmap.geometry.chi_square import chi2_quantile
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.cycles import CycleSupport
+from gsmap.optimize.duplicates import find_repeated
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.params import Params
 from gsmap.optimize.robust import chi_squares
@@ -15,6 +16,8 @@ from gsmap.optimize.structure import bridges, component_labels
 from gsmap.reason_codes import reason
 from gsmap.types import EdgeOutcome, PoseGraph, ScenePose
 from gsmap.types.plain import plain
+
+_REPEATED = reason("unconfirmed", "repeats another edge, because one of its scenes is a duplicate")
 
 
 def pose_graph(
@@ -27,15 +30,16 @@ def pose_graph(
     params: Params,
 ) -> PoseGraph:
     """Build the `PoseGraph` of scenes and edges by id; the caller adds its provenance."""
-    sure = state.accepted & ~state.doubtful
+    repeated = find_repeated(m)
+    sure = state.accepted & ~state.doubtful & ~repeated
     tied = component_labels(m, np.flatnonzero(sure))
     supported = state.accepted & state.doubtful & (tied[m.targets] == tied[m.sources])
     if not (state.doubtful & ~state.accepted).any():
         sure |= supported  # an edge between two different places does not close a cycle by chance
-    firm = sure & (~bridges(m, sure) | m.confirmed)
-    # Otherwise a doubtful edge confirms no other edge, and only undoubted edges confirm it.
+    firm = sure & (~bridges(m, sure) | m.confirmed | m.duplicate)
+    # Otherwise a doubtful or repeated edge confirms no other edge, and only the remaining edges confirm it.
     blocks = component_labels(m, np.flatnonzero(firm))
-    firm |= state.accepted & state.doubtful & (blocks[m.targets] == blocks[m.sources])
+    firm |= state.accepted & (state.doubtful | repeated) & (blocks[m.targets] == blocks[m.sources])
     status = _statuses(m, state.accepted, firm)
     return PoseGraph(
         poses={
@@ -48,7 +52,7 @@ def pose_graph(
             )
             for k, scene in enumerate(m.scene_ids)
         },
-        outcomes=_outcomes(m, poses, component, firm, status, state, cycles, params),
+        outcomes=_outcomes(m, poses, component, firm, repeated, status, state, cycles, params),
         settings=plain(params),
     )
 
@@ -58,6 +62,7 @@ def _outcomes(
     poses: Similarities,
     component: np.ndarray,
     firm: np.ndarray,
+    repeated: np.ndarray,
     status: np.ndarray,
     state: State,
     cycles: CycleSupport,
@@ -75,12 +80,14 @@ def _outcomes(
             why = reason("surfaces_differ", f"{_disagreement_text(m, k)}: the place changed, or these are two places")
             out[key] = EdgeOutcome("tentative", residual, why)
         elif state.accepted[k]:
-            why = reason("unconfirmed", "in no agreeing cycle: no other edge confirms it")
+            why = _REPEATED if repeated[k] else reason("unconfirmed", "in no agreeing cycle: no other edge confirms it")
             out[key] = EdgeOutcome("tentative", residual, why)
         elif not together[k]:
             why = state.pending.get(k) or reason(
                 "contradicts_component", "contradicts other edges between the two components"
             )
+            if repeated[k]:
+                why = _REPEATED
             if state.doubtful[k]:
                 why = reason("surfaces_differ", f"{_disagreement_text(m, k)}; {why}")
             elif state.ambiguous[k]:

@@ -29,6 +29,7 @@ class Edge:
         same_visit: both were captured so shortly after each other that next to nothing can have changed.
         log_odds_wrong: natural log-odds that the pose is wrong, by the evidence of registration and up to a constant
             that all edges share (`gsmap.optimize.edge_likelihood`); NaN where that is not known.
+        duplicate: both scenes were made from one capture, so each repeats the measurements of the other.
     """
 
     target: str
@@ -39,6 +40,7 @@ class Edge:
     disagreement: float = float("nan")
     same_visit: bool = False
     log_odds_wrong: float = float("nan")
+    duplicate: bool = False
 
 
 @dataclass(frozen=True, eq=False)

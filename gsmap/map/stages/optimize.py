@@ -18,6 +18,7 @@ from gsmap.map.shared_jobs import POLL_S
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.map.stages.describe import graph_keys
 from gsmap.methods import RecipeKey
+from gsmap.register.duplicate import SAME_CAPTURE
 from gsmap.store import Store
 from gsmap.store.scenes import SceneSummary
 from gsmap.types import Edge, PoseGraph, Prior
@@ -124,6 +125,7 @@ def _edges(store: Store, basis: PoseBasis, among: Collection[str] | None = None)
             disagreement=stored.registration.evidence.get("disagreement", float("nan")),
             same_visit=(stored.registration.target, stored.registration.source) in basis.same_visits,
             log_odds_wrong=solver.log_odds_wrong(stored.registration.evidence, stored.registration.overlap),
+            duplicate=any(note.startswith(SAME_CAPTURE) for note in stored.registration.notes),
         )
         for stored in store.registrations.current_usable(among)
         if stored.registration.S_target_source is not None and stored.registration.information is not None
