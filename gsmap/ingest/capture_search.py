@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections import Counter
@@ -11,7 +12,7 @@ from functools import cache
 from pathlib import Path
 
 from gsmap import formats
-from gsmap.errors import GsmapError, InputError, NotFoundError
+from gsmap.errors import MALFORMED, GsmapError, InputError, NotFoundError
 from gsmap.formats import scans
 
 MAX_DEPTH = 5
@@ -168,6 +169,17 @@ def _product(folder: Path) -> str | None:
     if (folder / "tiles.json").is_file() and any(folder.glob("component_*")):
         return "an export of gsmap"
     return None
+
+
+def exported_scenes(path: Path) -> set[str]:
+    """Return the ids of the scenes from which gsmap exported a file; empty for other files."""
+    for folder in path.resolve().parents[:2]:
+        try:
+            tiles = json.loads((folder / "tiles.json").read_bytes())["tiles"]
+            return {str(scene) for tile in tiles for scene in tile["S_map_scene"]}
+        except (OSError, *MALFORMED):
+            continue
+    return set()
 
 
 def _checkpoint(folder: Path) -> Path | None:

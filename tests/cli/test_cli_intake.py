@@ -205,6 +205,22 @@ def test_clouds_meshes_maps_and_exports_are_skipped_and_named(tmp_path: Path) ->
         assert m.store.quarantine.encountered == {}
 
 
+def test_an_export_of_the_maps_own_scenes_is_no_capture(tmp_path: Path) -> None:
+    formats.write(tmp_path / "hall.ply", splat())
+    cameras_json.write(tmp_path / "hall.cameras.json", looking_at())
+    with gsmap.map.create(tmp_path / "site.gsmap") as m:
+        scene = m.ingest(tmp_path / "hall.ply")[0].scene
+        m.update()
+        m.export(tmp_path / "out", format="ply")
+        exported = next((tmp_path / "out").glob("component_*/*.ply"))
+        assert m.ingest(tmp_path / "out", tmp_path / "hall.ply")[0].scene == scene
+        assert [row.id for row in m.scenes()] == [scene]
+        with raises(InputError, code="own_export"):
+            m.ingest(exported)
+    with gsmap.map.create(tmp_path / "other.gsmap") as m:
+        assert len(m.ingest(exported)) == 1
+
+
 def looking_at() -> Cameras:
     pose = np.eye(4)
     pose[2, 3] = -4.0

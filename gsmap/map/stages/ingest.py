@@ -11,12 +11,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gsmap.errors import ConfigError, GsmapError, NotGaussiansError, StoreError
+from gsmap.errors import ConfigError, GsmapError, InputError, NotGaussiansError, StoreError
 from gsmap.ingest import (
     Capture,
     SearchResult,
     SkippedPath,
     check_scale,
+    exported_scenes,
     given_date,
     read_capture,
     search_captures,
@@ -90,13 +91,20 @@ def ingest(
         for i, one in enumerate(found):
             progress("ingest", i / len(found), one.name)
             try:
+                if one.path is not None and not exported_scenes(one.path).isdisjoint(dates):
+                    raise InputError(
+                        f"{one.path} is an export of scenes of this map: it would confirm their poses by themselves",
+                        code="own_export",
+                    )
                 results.append(_add(store, one.read(), dates))
             except StoreError:  # of the map, and so of every capture
                 raise
             except GsmapError as error:
                 if is_only_one or one.path is None:
                     raise
-                (skipped if isinstance(error, NotGaussiansError) else bad).append(SkippedPath(one.path, str(error)))
+                (skipped if error.code in ("not_gaussians", "own_export") else bad).append(
+                    SkippedPath(one.path, str(error))
+                )
             else:
                 good += [] if one.path is None else [one.path]
     if len(skipped) > len(search.skipped) and not results and not bad:
