@@ -21,13 +21,16 @@ _SAME_M = 0.25  # landmarks of one thing lie so near to each other at most
 _LAYERS = ("landmarks", "landmarks:1", "objects")
 
 
-def pair_detail(store: Store, settings: Settings, a: Scene, b: Scene, S_map_target: Sim3) -> dict[str, Any]:
+def pair_detail(
+    store: Store, settings: Settings, a: Scene, b: Scene, S_map_target: Sim3, *, has_buttons: bool = False
+) -> dict[str, Any]:
     """Return the `EdgeDetail` of a pair, without its scenes and views.
 
     Args:
         S_map_target: the shown pose of the target.
+        has_buttons: name the buttons of the page in place of commands.
     """
-    said, pair = explain_pair(store, settings, a, b), pair_report(store, a, b)
+    said, pair = explain_pair(store, settings, a, b, has_buttons=has_buttons), pair_report(store, a, b)
     S = pair.S_target_source
     ends = (pair.target, pair.source)
     shared = [] if S is None else correspondences(store, ends, S, S_map_target)

@@ -24,7 +24,7 @@ from gsmap.map.page_pairs import pair_detail
 from gsmap.map.photos import photo_rows
 from gsmap.map.reports.one_pair import is_one_pair, scenes_by_one_pair
 from gsmap.map.snapshot_read import snapshot_read
-from gsmap.map.stages.change import plan_comparisons
+from gsmap.map.stages.change import ComparisonPlan, missing_comparisons, plan_comparisons
 from gsmap.map.stages.optimize import pose_basis
 from gsmap.methods import text_digest
 from gsmap.report.content import EdgeEntry
@@ -184,7 +184,9 @@ class MapPageSource:
         a, b = self._entry(target), self._entry(source)
         at = self._places()
         ends = {"target": at[target], "source": at[source]}
-        return ends | pair_detail(self._store, self._settings, a.scene, b.scene, a.S_map_scene)
+        return ends | pair_detail(
+            self._store, self._settings, a.scene, b.scene, a.S_map_scene, has_buttons=bool(self.actions)
+        )
 
     def pair_cameras(self, target: str, source: str) -> tuple[str, ...]:
         stored = self._store.registrations.get(target, source)
@@ -318,6 +320,8 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
     ]
     living = {entry.scene.id for entry in scenes}
     newest, given = store.revisions.newest(), pose_basis(store, settings)
+    asked = plan_comparisons(store, settings) if placed else None
+    missing = missing_comparisons(store, asked, settings) if asked else []
     found = ViewMap(
         Path(store.location).name,
         scenes,
@@ -326,11 +330,13 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
             ViewRevision(row.number, row.created_at, row.scenes, row.edges_used, row.dropped_at is None)
             for row in reports.revision_rows(store)
         ],
-        _changes(store, settings, placed, living),
+        _changes(store, settings, asked, living),
         _photos(store, placed, living),
         revision=store.revisions.newest_number(),
         metres_per_unit={component: metre.metres_per_unit for component, metre in metres.items()},
         scale_sigma={component: metre.sigma for component, metre in metres.items() if not metre.is_rough},
+        compared=[pair for pair in asked.pairs if pair not in missing] if asked else [],
+        uncompared=missing,
         merged=merged,
         has_objects=placed is not None and bool(graphs),
         stale=bool(given.scenes) and (newest is None or newest.key != given.key.digest),
@@ -407,13 +413,11 @@ def _edges(store: Store, placed: PoseGraph | None) -> list[ViewEdge]:
     return out
 
 
-def _changes(store: Store, settings: Settings, placed: PoseGraph | None, living: set[str]) -> list[ViewChange]:
+def _changes(store: Store, settings: Settings, asked: ComparisonPlan | None, living: set[str]) -> list[ViewChange]:
     """Return the stored changes, without comparing scenes."""
-    if placed is None:
+    if asked is None:
         return []
-    report = changes_report(
-        store, settings, plan_comparisons(store, settings), min_confidence=settings.change.min_confidence
-    )
+    report = changes_report(store, settings, asked, min_confidence=settings.change.min_confidence)
     return [
         ViewChange(
             row.id,

@@ -22,15 +22,19 @@ from gsmap.types.rows.pairs import ExplanationStep, PairExplanation, PairReport
 
 
 @snapshot_read
-def explain_pair(store: Store, settings: Settings, a: Scene, b: Scene) -> PairExplanation:
-    """List every step of a pair from stored results, without computing anything again."""
+def explain_pair(store: Store, settings: Settings, a: Scene, b: Scene, *, has_buttons: bool = False) -> PairExplanation:
+    """List every step of a pair from stored results, without computing anything again.
+
+    Args:
+        has_buttons: name the buttons of the page in place of commands.
+    """
     pair = pair_report(store, a, b)
     is_tried = pair.status != "never registered"
     rank, untried = _retrieval(store, settings, a, b)
     value = f"tried{rank}" if is_tried else f"never tried{rank}; {untried}"
     retrieval = ExplanationStep(name="retrieval", value=value, bar="among the candidates", passed=is_tried)
     steps = [retrieval, *_steps(pair, settings)]
-    advice = _advice(pair, {step.name: step for step in steps}, untried)
+    advice = _advice(pair, {step.name: step for step in steps}, untried, has_buttons)
     ends = {name: getattr(pair, name) for name in ("target", "target_name", "source", "source_name")}
     return PairExplanation(
         **ends, status=pair.status, reason=pair.reason, reason_code=pair.reason_code, steps=tuple(steps), advice=advice
@@ -145,9 +149,11 @@ def _evidence(pair: PairReport, bars: verdict.Params, max_disagreement: float) -
     ]
 
 
-def _advice(pair: PairReport, steps: Mapping[str, ExplanationStep], untried: str) -> str:
+def _advice(pair: PairReport, steps: Mapping[str, ExplanationStep], untried: str, has_buttons: bool) -> str:
     """Return advice for the first open step; empty if there is none."""
     a, b, at = pair.target_name, pair.source_name, "MAP"
+    confirm = "Confirm, below" if has_buttons else f"gsmap confirm {at} {pair.pair}"
+    review = "Confirm or Reject, below" if has_buttons else f"gsmap confirm or reject {at} {pair.pair}"
     failed = {name for name, step in steps.items() if step.passed is False}
     if pair.review or pair.used is True:
         return ""
@@ -158,19 +164,15 @@ def _advice(pair: PairReport, steps: Mapping[str, ExplanationStep], untried: str
         return (
             "either the place changed, or two places look alike; to decide, add a capture that walks from what "
             f"{a} shows to what {b} shows, or date both captures "
-            f"(gsmap edit {at} SCENE --captured-at DATE); if you know the answer: gsmap confirm or reject {at} "
-            f"{pair.pair}"
+            f"(gsmap edit {at} SCENE --captured-at DATE); if you know the answer: {review}"
         )
     if pair.status == "accepted":
         return (
             f"a further capture that overlaps both {a} and {b} closes a loop that confirms or "
-            f"contradicts the edge; if you know the answer: gsmap confirm or reject {at} {pair.pair}"
+            f"contradicts the edge; if you know the answer: {review}"
         )
     if "coinciding cells" in failed or pair.status == "no_match":
         return f"add a capture of the way from {a} to {b} that shares about a third with each"
     if "free-space violation" in failed or in_doubt:
-        return (
-            "either two places look alike, or one place changed a lot; if you know that it is one place: "
-            f"gsmap confirm {at} {pair.pair}"
-        )
+        return f"either two places look alike, or one place changed a lot; if you know that it is one place: {confirm}"
     return f"add a capture that shows more of what {a} and {b} share, from both sides"

@@ -156,6 +156,8 @@ class ViewMap:
         metres_per_unit: Metres per map unit of each component.
         scale_sigma: Standard deviation of its logarithm; a component of unknown scale is missing.
         merged: Components with merged tiles.
+        compared: Pairs (older, newer) of scene ids that were compared for changes.
+        uncompared: Pairs that ``gsmap changes`` would compare.
         has_objects: The map has objects.
         stale: The poses are outdated, because edges or priors changed after the revision.
     """
@@ -171,6 +173,8 @@ class ViewMap:
     metres_per_unit: Mapping[int, float] = field(default_factory=dict)
     scale_sigma: Mapping[int, float] = field(default_factory=dict)
     merged: frozenset[int] = frozenset()
+    compared: Sequence[tuple[str, str]] = ()
+    uncompared: Sequence[tuple[str, str]] = ()
     has_objects: bool = False
     stale: bool = False
 
@@ -305,6 +309,8 @@ def summary(view: ViewMap, served: ServerState) -> dict[str, Any]:
             for one in view.changes
             if one.before in at and one.after in at
         ],
+        "compared": [[at[a], at[b]] for a, b in view.compared if a in at and b in at],
+        "uncompared": [[at[a], at[b]] for a, b in view.uncompared if a in at and b in at],
         "photos": [
             {
                 "file": one.file,

@@ -118,6 +118,8 @@ def made_map(scenes: int = 12, second_island: int = 2, hostile: bool = False) ->
             for k in (1, 2, 3)
         ],
         "changes": changes,
+        "compared": [],
+        "uncompared": [],
         "photos": [
             {
                 "file": f"IMG_{i:04d}.jpg",
@@ -208,6 +210,12 @@ class MadeServer:
                 self.priors.append(f"pose, {body['sigma_m']} m, {body['sigma_deg']}°")
             number = {"prior": len(self.priors), "remove_prior": None}.get(name, body.get("number"))
             scene |= {"prior": None if number is None else self.priors[number - 1], "prior_number": number}
+        elif name == "date":
+            scene = next(row for row in self.map["scenes"] if row["id"] == body["scene"])
+            scene["captured_at"] = None if body["captured_at"] == "none" else body["captured_at"]
+        elif name == "compare":
+            self.map["compared"] += self.map["uncompared"]
+            self.map["uncompared"] = []
         elif name == "name_object":
             self.names[body["object"]] = body["name"]
         elif name == "optimize":

@@ -240,7 +240,7 @@ def test_one_click_shows_both_captures_and_the_evidence(hands, server):
     hands.wait("findAll('dialog[open]').length === 0 && find('.enlarge', null)")
     hands.click("label", "84 correspondences")
     assert told(hands, "setCorrespondences") == [None]
-    hands.click("button", "Beside each other")
+    hands.click("button", "Compare in 3D")
     assert told(hands, "setSplit")[0]["scenes"] == [2]
     assert told(hands, "setVisible") == [[1]]
 
@@ -397,8 +397,11 @@ def test_time_slider_over_dates_and_revisions(hands):
 def test_changes_are_listed_by_kind_and_reviewed(hands, server):
     hands.press("3")
     assert told(hands, "setChanges") == [["c6", "c5", "c4", "c2", "c1", "c3"]]
-    hands.click("button.choose", "replaced")
+    hands.click("button.choose", "Replaced")
     hands.wait("find('img', null)?.naturalWidth === 960")
+    pair = "office east 2024-05 (11 May 2024) → office west 2024-06 (11 Jun 2024)"
+    assert pair in hands.text("gs-time")
+    assert pair in hands.text("gs-change")
     assert told(hands, "fit")[0] == pytest.approx(np.array([[11.4, -0.5, -0.8], [13.2, 1, 1.6]]))
     hands.press("c")
     hands.says("confirmed", "gs-change")
@@ -409,6 +412,24 @@ def test_changes_are_listed_by_kind_and_reviewed(hands, server):
     hands.press("u")
     hands.says("Undone: change c4")
     assert server.log[-1] == ("withdraw", {"what": "c4", "note": ""})
+
+
+def test_no_known_change_is_undated_uncompared_or_unchanged(hands, server):
+    server.map.update(changes=[], uncompared=[[0, 1], [1, 2]], state="s8")
+    hands.press("3")
+    hands.wait("find('button', 'Compare them now')", 10)
+    text = hands.text("gs-time")
+    assert "hall 2024-01 (11 Jan 2024) → stairs 2024-02 (11 Feb 2024)" in text
+    assert "Nothing changed" not in text
+    fill(hands, "find('input[type=date]', null)", "2024-04-01")
+    hands.wait("findAll('gs-time input[type=date]').length === 0")
+    assert server.log[-1] == ("date", {"scene": "000000000003", "captured_at": "2024-04-01"})
+    hands.press("u")
+    idle(hands)
+    assert server.log[-1] == ("date", {"scene": "000000000003", "captured_at": "none"})
+    hands.click("button", "Compare them now")
+    hands.says("Nothing changed between", "gs-time")
+    assert server.log[-1] == ("compare", {})
 
 
 def test_a_picked_place_tells_its_history_and_picked_things_are_chosen(hands):
@@ -481,6 +502,10 @@ def test_what_one_pair_places_is_called_so(hands, server):
     hands.press("2")
     hands.click("button", "One pair")
     assert hands.value("findAll('.mark').map((e) => e.textContent)") == ["one pair"]
+    hands.press("j")
+    hands.says("kitchen 2024-03 is placed by this pair alone", "gs-edge")
+    hands.press("c")
+    hands.wait("find('button', 'Undo: review of stairs 2024-02 : kitchen 2024-03')")
 
 
 def test_an_object_is_seen_hovered_and_given_a_name(hands, server):
@@ -531,7 +556,7 @@ def test_objects_and_photos(hands):
 def test_the_whole_view_is_in_the_address_and_comes_back(hands, server):
     hands.click("button", "Only hall 2024-01")
     hands.press("v", "x", "h", "3")
-    hands.click("button.choose", "replaced")
+    hands.click("button.choose", "Replaced")
     hands.value("find('#until', null).focus()")
     hands.press("ArrowLeft")
     hands.value("find('#revision', null).focus()")
@@ -760,9 +785,9 @@ def test_names_notes_and_addresses_of_a_map_are_not_trusted(built, tmp_path):
                 hands.press("j")
                 hands.value("new Promise((rest) => setTimeout(rest, 100))")
             hands.value("find('[role=tab]', 'Time').click()")
-            hands.click("button.choose", "appeared")
+            hands.click("button.choose", "Appeared")
             hands.says("There is no picture", "gs-change")
-            hands.click("button.choose", "disappeared")
+            hands.click("button.choose", "Disappeared")
             hands.says("There is no picture", "gs-change")
             hands.press("2")
             hands.click("button.choose", "kitchen 2024-03")

@@ -141,6 +141,22 @@ def test_a_scene_that_is_moved_by_hand_is_a_prior_and_no_longer(opened):
     assert m.store.priors.list() == []
 
 
+def test_captures_are_dated_and_compared_from_the_page(opened):
+    m, _, hands = opened
+    m.edit("cellar", captured_at="none")
+    hands.press("3")
+    hands.wait("find('input[type=date]', null)", 30)
+    hands.value(
+        "(() => { const e = find('input[type=date]', null); e.value = '2025-03-10';"
+        " e.dispatchEvent(new Event('change')); })()"
+    )
+    hands.wait("!find('input[type=date]', null) && find('button:not(:disabled)', 'Compare them now')", 30)
+    assert next(scene for scene in m.store.scenes.list() if scene.name == "cellar").captured_at.startswith("2025-03-10")
+    hands.click("button", "Compare them now")
+    hands.wait("!find('button', 'Compare them now')", 120)
+    assert m.store.changes.current()
+
+
 def test_time_split_and_clip_are_drawn_and_come_back_by_the_address(opened):
     _, server, hands = opened
     whole = hands.value("gsmap.splats")

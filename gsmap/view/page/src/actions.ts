@@ -520,7 +520,7 @@ export function review(what: Selection, verdict: Verdict, note = ""): Promise<bo
     return Promise.resolve(false);
   }
   const undo: Undo = {
-    label: `${DONE[verdict].toLowerCase()}: ${before.name}`,
+    label: `review of ${before.name}`,
     run: () =>
       send(
         before.verdict,
@@ -568,6 +568,20 @@ export const optimize = () =>
     {},
     { doing: "optimizing: all poses are solved for anew", done: "Optimized: a new revision is shown" },
   );
+
+export const compare = () =>
+  send(
+    "compare",
+    {},
+    { doing: "comparing captures: minutes on a large map", done: "Compared: changes are listed by date" },
+  );
+
+export function setDate({ id, name, captured_at: before }: SceneEntry, at: string): Promise<boolean> {
+  const said = { doing: `dating ${name}`, done: at ? `Dated: ${name}` : `Date of ${name} taken back` };
+  const told = (when: string | null, undo?: Undo) =>
+    send("date", { scene: id, captured_at: when || "none" }, undo ? { ...said, undo } : said);
+  return told(at, { label: `date of ${name}`, run: () => told(before) });
+}
 
 export async function nameObject(id: string, name: string, before: string): Promise<boolean> {
   const told = (text: string, said: string): Promise<boolean> =>

@@ -21,6 +21,8 @@ export interface MapSummary {
   edges: EdgeEntry[];
   revisions: RevisionEntry[];
   changes: ChangeEntry[];
+  compared: [number, number][]; // older and newer scene that were compared for changes, at the poses of now
+  uncompared: [number, number][]; // those that the action `compare` would compare
   photos: PhotoEntry[];
   counts: { gaussians: number };
   graph: string | null; // GET: GraphEntry; null where there is none
@@ -223,5 +225,7 @@ export interface Actions {
   earlier_prior: { scene: string; number: number }; // what was told of it before, by its number, holds again
   remove_prior: { scene: string };
   optimize: Record<string, never>;
+  compare: Record<string, never>;
+  date: { scene: string; captured_at: string }; // ISO 8601; "none" takes it away
   name_object: { object: string; name: string }; // an empty name takes the last one back
 }

@@ -1,7 +1,7 @@
 // The keys of the page: one table, which the help shows and the page obeys.
 import * as actions from "./actions";
 import * as derive from "./derive";
-import { page, TABS } from "./state";
+import { page, TAB_NAMES, TABS } from "./state";
 
 export interface Key {
   key: string;
@@ -69,10 +69,12 @@ const mayAct = (what: () => void) => () => {
 
 export const KEYS: readonly Key[] = [
   { key: "?", what: "This help", group: "Everywhere", press: () => actions.help() },
-  ...TABS.map((name, i): Key => {
-    const title = name[0]?.toUpperCase() + name.slice(1);
-    return { key: String(i + 1), what: title, group: "Everywhere", press: () => actions.tab(name) };
-  }),
+  ...TABS.map((name, i): Key => ({
+    key: String(i + 1),
+    what: TAB_NAMES[name],
+    group: "Everywhere",
+    press: () => actions.tab(name),
+  })),
   { key: "/", what: "Find in the list", group: "Everywhere", press: findBox },
   { key: "p", what: "Fold or open the panel", group: "Everywhere", press: () => actions.fold() },
   { key: "l", what: "Copy a link to this view", group: "Everywhere", press: () => void actions.copyLink() },
@@ -85,7 +87,7 @@ export const KEYS: readonly Key[] = [
   { key: "n", what: "Write a note, or the name of an object", group: "Review", press: writeNote },
   { key: "u", what: "Undo the last action", group: "Review", press: mayAct(() => void actions.undo()) },
   { key: "o", what: "Optimize now", group: "Review", press: mayAct(() => void actions.optimize()) },
-  { key: "b", what: "Blink, swipe, beside, difference", group: "Review", press: actions.nextComparison },
+  { key: "b", what: "Blink, swipe, side by side, difference", group: "Review", press: actions.nextComparison },
   { key: ",", what: "Previous camera", group: "Review", press: () => actions.view(-1, views()) },
   { key: ".", what: "Next camera", group: "Review", press: () => actions.view(1, views()) },
   { key: "f", what: "Fit all in view", group: "View", press: actions.fit },

@@ -5,6 +5,7 @@ import type { Pick, Source, Stage, Standpoint } from "./stage/stage";
 
 export const TABS = ["look", "review", "time", "things"] as const;
 export type Tab = (typeof TABS)[number];
+export const TAB_NAMES: Record<Tab, string> = { look: "Look", review: "Review", time: "Time", things: "Objects" };
 
 export const OVERLAYS = ["cameras", "nodes", "boxes", "edges", "ellipsoids", "objects", "rooms", "photos"] as const;
 export type Overlay = (typeof OVERLAYS)[number];

@@ -1,5 +1,5 @@
 // Numbers, dates and lengths as the page writes them.
-import type { Box, Matrix, ObjectEntry, PhotoEntry, Vector } from "./contract";
+import type { Box, ChangeEntry, MapSummary, Matrix, ObjectEntry, PhotoEntry, Vector } from "./contract";
 import type { Standpoint } from "./stage/stage";
 
 const count = new Intl.NumberFormat("en");
@@ -57,6 +57,23 @@ export function moved(from: Matrix, now: Matrix, middle: Vector, metresPerUnit: 
     degrees: (Math.acos(cosine) * 180) / Math.PI,
   };
 }
+
+/** What is said of a change, in its row and in its panel. */
+export const CHANGE_WORDS: Record<ChangeEntry["kind"], string> = {
+  appeared: "Appeared",
+  disappeared: "Disappeared",
+  moved: "Moved",
+  recoloured: "Another colour",
+  replaced: "Replaced by another",
+  lighting: "Lit differently",
+};
+
+/** The older and the newer capture: "hall (3 Mar 2026) → hall again (2 Apr 2026)". */
+export const pairText = (map: MapSummary, older: number, newer: number) =>
+  [older, newer]
+    .map((index) => map.scenes[index])
+    .map((scene) => `${scene?.name ?? "?"} (${day(scene?.captured_at ?? null)})`)
+    .join(" → ");
 
 /** What an object is called: by people, else by its number. */
 export const titleOf = (one: ObjectEntry) => one.name || (one.label ? `${one.label} (${one.id})` : one.id);

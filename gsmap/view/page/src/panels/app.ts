@@ -4,7 +4,7 @@ import type { PropertyValues } from "lit";
 import { customElement } from "lit/decorators.js";
 import * as actions from "../actions";
 import * as derive from "../derive";
-import { TABS } from "../state";
+import { TAB_NAMES, TABS } from "../state";
 import type { Tab } from "../state";
 import { Panel } from "./base";
 import { shared } from "./css";
@@ -25,8 +25,6 @@ import "./thing";
 import "./things";
 import "./time";
 import "./tools";
-
-const NAMES: Record<Tab, string> = { look: "Look", review: "Review", time: "Time", things: "Things" };
 
 @customElement("gs-app")
 export class App extends Panel {
@@ -304,7 +302,7 @@ export class App extends Panel {
       tabindex=${isOn ? 0 : -1}
       @click=${() => actions.tab(name)}
     >
-      ${NAMES[name]}${doubtful ? html`<span class="badge" aria-label="${doubtful} to review">${doubtful}</span>` : nothing}
+      ${TAB_NAMES[name]}${doubtful ? html`<span class="badge" aria-label="${doubtful} to review">${doubtful}</span>` : nothing}
     </button>`;
   }
 

@@ -4,7 +4,7 @@ import { customElement, state } from "lit/decorators.js";
 import * as actions from "../actions";
 import { relative } from "../api";
 import * as derive from "../derive";
-import { day, metres, percent } from "../words";
+import { CHANGE_WORDS, metres, pairText, percent } from "../words";
 import { Panel } from "./base";
 import { shared } from "./css";
 import { heading } from "./heading";
@@ -56,9 +56,10 @@ export class ChangeDetail extends Panel {
     const isBroken = this.broken === change.id;
     return html`
       ${heading(
-        html`<gs-kind of=${change.kind}></gs-kind> ${SAID[change.kind] ?? change.kind}`,
+        html`<gs-kind of=${change.kind}></gs-kind> ${CHANGE_WORDS[change.kind] ?? change.kind}`,
         html`<span class="mark ${STANDS[change.status] ?? ""}">${change.status}</span>
-          <span>confidence ${percent(change.confidence)}</span> <span>${change.id}</span>`,
+          <span>confidence ${percent(change.confidence)}</span>
+          <span class="anywhere">${pairText(map, change.before, change.after)}</span> <span>${change.id}</span>`,
         true,
       )}
       <div class="body">
@@ -91,14 +92,8 @@ export class ChangeDetail extends Panel {
         </section>
         <section>
           <dl class="facts">
-            <dt>Seen on</dt>
-            <dd>${day(change.at)}</dd>
             <dt>Size of the box</dt>
             <dd>${sides.join(" × ")}</dd>
-            <dt>Before</dt>
-            <dd>${before?.name}, ${day(before?.captured_at ?? null)}</dd>
-            <dt>After</dt>
-            <dd>${after?.name}, ${day(after?.captured_at ?? null)}</dd>
           </dl>
         </section>
       </div>
@@ -110,12 +105,3 @@ export class ChangeDetail extends Panel {
     `;
   }
 }
-
-const SAID: Record<string, string> = {
-  appeared: "Appeared",
-  disappeared: "Disappeared",
-  moved: "Moved",
-  recoloured: "Another colour",
-  replaced: "Replaced by another",
-  lighting: "Lit differently",
-};

@@ -13,7 +13,7 @@ import { icon } from "./icons";
 const NAMES: Record<Comparison, string> = {
   blink: "Blink",
   swipe: "Swipe",
-  beside: "Beside",
+  beside: "Side by side",
   difference: "Difference",
 };
 const BLINK_MS = 700;

@@ -119,6 +119,7 @@ export const shared = css`
   input[type="text"],
   input[type="search"],
   input[type="number"],
+  input[type="date"],
   textarea,
   select {
     width: 100%;

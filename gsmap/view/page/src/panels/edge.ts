@@ -2,7 +2,7 @@
 import { css, html, nothing } from "lit";
 import { customElement } from "lit/decorators.js";
 import * as actions from "../actions";
-import type { EdgeDetail, EdgeEntry, MapSummary } from "../contract";
+import type { EdgeDetail, EdgeEntry, MapSummary, SceneEntry } from "../contract";
 import * as derive from "../derive";
 import { page } from "../state";
 import { moment, percent, plural } from "../words";
@@ -129,7 +129,7 @@ export class Edge extends Panel {
         true,
       )}
       <div class="body">
-        ${edge.reason ? html`<p class="anywhere reason">${edge.reason}</p>` : nothing}
+        ${this.reason(edge, a, b)}
         ${waiting(
           known,
           "Both captures are rendered from the cameras of the pair",
@@ -139,6 +139,17 @@ export class Edge extends Panel {
       </div>
       <gs-verdict .of=${state.selection} .said=${edge.review} .note=${edge.note}></gs-verdict>
     `;
+  }
+
+  private reason(edge: EdgeEntry, a: SceneEntry, b: SceneEntry) {
+    if (derive.standing(edge) !== "one pair" || edge.review)
+      return edge.reason ? html`<p class="anywhere reason">${edge.reason}</p>` : nothing;
+    const alone = [a, b].filter((scene) => scene.status === "one pair").map((scene) => scene.name);
+    return html`<p class="anywhere reason">
+      ${alone.length === 1 ? `${alone[0]} is placed` : "The two are tied"} by this pair alone: no third capture checks
+      it. Look whether the pictures show one
+      place${actions.mayAct(this.state) ? ", then press Confirm or Reject below: that settles it" : nothing}.
+    </p>`;
   }
 
   private known(detail: EdgeDetail, edge: EdgeEntry, map: MapSummary) {
@@ -230,7 +241,7 @@ export class Edge extends Panel {
       <button @click=${() => actions.flyToSelected()}>${icon("fly")} Fly to it</button>
       ${
         isTogether
-          ? html`<button @click=${() => actions.splitPair(a.id, b.id)}>${icon("split")} Beside each other</button>`
+          ? html`<button @click=${() => actions.splitPair(a.id, b.id)}>${icon("split")} Compare in 3D</button>`
           : nothing
       }
       ${
@@ -240,7 +251,7 @@ export class Edge extends Panel {
                 type="checkbox"
                 .checked=${this.state.correspondences}
                 @change=${(event: Event) => page.set({ correspondences: (event.target as HTMLInputElement).checked })}
-              />${plural(count, "correspondence")}</label
+              />Draw ${plural(count, "correspondence")} in 3D</label
             >`
           : nothing
       }

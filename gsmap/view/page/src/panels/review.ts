@@ -76,6 +76,14 @@ export class Review extends Panel {
           flex: none;
         }
       }
+      .undo {
+        min-width: 0;
+      }
+      .cut {
+        overflow: hidden;
+        text-overflow: ellipsis;
+        white-space: nowrap;
+      }
       footer {
         display: grid;
         gap: 8px;
@@ -149,13 +157,13 @@ export class Review extends Panel {
           ${icon("optimize")} Optimize now
         </button>
         <button
-          class="grow"
+          class="grow undo"
           ?disabled=${!last || state.busy !== null}
           title=${last ? `Undo ${last.label} (u)` : "Nothing to undo"}
           @click=${() => void actions.undo()}
         >
           ${icon("undo")}
-          Undo${state.undo.length > 1 ? html` <span class="muted">(${state.undo.length})</span>` : nothing}
+          <span class="cut">Undo${last ? `: ${last.label}` : nothing}</span>
         </button>
       </div>
     </footer>`;

@@ -83,9 +83,10 @@ export class Thing extends Panel {
             ${
               room
                 ? html`<dt>Room</dt>
-                    <dd>${room.id}, ${room.area_m2.toFixed(1)} m²</dd>
-                    <dt>Doors to</dt>
-                    <dd>${room.doors.join(", ") || "none seen"}</dd>`
+                    <dd>
+                      ${room.id}, ${room.area_m2.toFixed(1)}
+                      m²${room.doors.length ? `, with doors to ${room.doors.join(", ")}` : ""}
+                    </dd>`
                 : nothing
             }
             <dt>Seen</dt>

@@ -2,16 +2,18 @@
 import { css, html, nothing } from "lit";
 import { customElement } from "lit/decorators.js";
 import * as actions from "../actions";
-import type { ChangeEntry } from "../contract";
+import type { ChangeEntry, MapSummary, SceneEntry } from "../contract";
 import * as derive from "../derive";
 import { CHANGE_FILTERS, page } from "../state";
 import type { ChangeFilter } from "../state";
-import { day, moment, percent, plural } from "../words";
+import { CHANGE_WORDS, day, moment, pairText, percent, plural } from "../words";
 import { Panel } from "./base";
 import { shared } from "./css";
 import { icon } from "./icons";
 import "./kind";
 import "./listing";
+
+const MOST_UNDATED = 20; // captures that have a field for their date at a time
 
 const NAMES: Record<ChangeFilter, string> = { open: "Open", confirmed: "Confirmed", rejected: "Rejected", all: "All" };
 
@@ -44,12 +46,19 @@ export class Time extends Panel {
       .chips {
         margin-bottom: 6px;
       }
+      input[type="date"] {
+        width: auto;
+      }
+      .stack,
+      .pairs {
+        margin-top: 10px;
+      }
     `,
   ];
 
   protected override render() {
     if (!this.state.map) return nothing;
-    return html`${this.dates()} ${this.revisions()} ${this.changes()}`;
+    return html`${this.changes()} ${this.dates()} ${this.revisions()}`;
   }
 
   private dates() {
@@ -61,9 +70,7 @@ export class Time extends Panel {
     if (!days.length)
       return html`<section>
         <h3>${has}</h3>
-        <p class="muted">
-          No capture of this component has a date. <kbd>gsmap edit MAP SCENE --captured-at DATE</kbd> gives it one.
-        </p>
+        <p class="muted">No capture of this component has a date.</p>
       </section>`;
     const last = days.length - 1;
     const at =
@@ -144,8 +151,10 @@ export class Time extends Panel {
 
   private changes() {
     const { state } = this;
+    const { map } = state;
+    if (!map) return nothing;
     const changes = derive.listedChanges(state);
-    const ofComponent = state.map?.changes.filter((one) => one.component === state.component) ?? [];
+    const ofComponent = map.changes.filter((one) => one.component === state.component);
     const chosen = state.selection?.kind === "change" ? state.selection.key : null;
     const count = (name: ChangeFilter) =>
       ofComponent.filter((one) => (name === "all" || one.status === name) && derive.isBy(one.at, state.until)).length;
@@ -177,17 +186,81 @@ export class Time extends Panel {
               .chosen=${chosen}
               .stamp=${state}
             ></gs-listing>`
-          : html`<p class="empty">
-              ${
-                ofComponent.length
-                  ? state.until === null
-                    ? "None of this kind."
-                    : `None until ${day(state.until)}.`
-                  : "No change is known: gsmap changes compares captures of one place with different dates."
-              }
-            </p>`
+          : ofComponent.length
+            ? html`<p class="empty">
+                ${state.until === null ? "None of this kind." : `None until ${day(state.until)}.`}
+              </p>`
+            : this.unchanged(map)
       }
+      ${this.undated(map)} ${this.uncompared(map)}
     </section>`;
+  }
+
+  private isHere(map: MapSummary, [, newer]: [number, number]): boolean {
+    return map.scenes[newer]?.component === this.state.component;
+  }
+
+  private unchanged(map: MapSummary) {
+    const pairs = map.compared.filter((pair) => this.isHere(map, pair));
+    if (!pairs.length) return nothing;
+    return html`<p>Nothing changed between</p>
+      <ul class="pairs">
+        ${pairs.map((pair) => html`<li class="anywhere">${pairText(map, ...pair)}</li>`)}
+      </ul>`;
+  }
+
+  /** What was never compared: nothing is known of it, which is not the same as no change. */
+  private uncompared(map: MapSummary) {
+    const pairs = map.uncompared.filter((pair) => this.isHere(map, pair));
+    if (!pairs.length) return nothing;
+    return html`<div class="stack">
+      <p>Not compared yet, so that nothing is known of their changes:</p>
+      <ul class="pairs">
+        ${pairs.map((pair) => html`<li class="anywhere">${pairText(map, ...pair)}</li>`)}
+      </ul>
+      ${
+        actions.mayAct(this.state)
+          ? html`<p>
+              <button class="main" ?disabled=${this.state.busy !== null} @click=${() => void actions.compare()}>
+                Compare them now
+              </button>
+            </p>`
+          : html`<p><kbd>gsmap changes ${map.title}</kbd></p>`
+      }
+    </div>`;
+  }
+
+  private undated(map: MapSummary) {
+    const scenes = map.scenes.filter((one) => one.component === this.state.component && !one.captured_at);
+    const [first] = scenes;
+    if (!first) return nothing;
+    const shown = scenes.slice(0, MOST_UNDATED);
+    return html`<div class="stack">
+      <p>
+        ${plural(scenes.length, "capture has", "captures have")} no date, so that which is newer is not known: nothing
+        is compared with ${scenes.length === 1 ? "it" : "them"}.
+      </p>
+      ${
+        actions.mayAct(this.state)
+          ? shown.map(
+              (scene) =>
+                html`<label class="row spread"
+                  ><span class="anywhere">${scene.name}</span
+                  ><input
+                    type="date"
+                    aria-label="Date of ${scene.name}"
+                    ?disabled=${this.state.busy !== null}
+                    @change=${(event: Event) => this.setDate(scene, event.target as HTMLInputElement)}
+                /></label>`,
+            )
+          : html`<p><kbd>gsmap edit ${map.title} ${first.name} --captured-at 2026-03-31</kbd></p>`
+      }
+      ${scenes.length > shown.length ? html`<p class="muted small">and ${scenes.length - shown.length} more</p>` : nothing}
+    </div>`;
+  }
+
+  private setDate(scene: SceneEntry, { value }: HTMLInputElement): void {
+    if (value) void actions.setDate(scene, value);
   }
 
   private readonly row = (change: ChangeEntry) => {
@@ -195,12 +268,12 @@ export class Time extends Panel {
     return html`<span role="gridcell" class="wide"
       ><button class="choose" @click=${() => actions.select({ kind: "change", key: change.id })}>
         <span class="name"
-          ><gs-kind of=${change.kind}></gs-kind> ${change.kind}
+          ><gs-kind of=${change.kind}></gs-kind> ${CHANGE_WORDS[change.kind] ?? change.kind}
           <span class="muted">${percent(change.confidence)}</span></span
         >
         <span class="detail"
-          ><span>${change.status === "open" ? map?.scenes[change.after]?.name : change.status}</span
-          ><span>${day(change.at)}</span></span
+          ><span>${map ? pairText(map, change.before, change.after) : nothing}</span
+          ><span>${change.status === "open" ? nothing : change.status}</span></span
         >
       </button></span
     >`;
