@@ -9,7 +9,7 @@ import re
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Any
@@ -108,12 +108,18 @@ class Answers:
         """
         for pattern, route in self._routes:
             if (found := pattern.fullmatch(path)) is not None:
-                return route(*found.groups(), **({"asked": asked} if route in self._asking else {}))
+                # What a person waits for goes before levels of detail, which come by and by.
+                with nullcontext() if route in self._of_levels else self._levels.paused():
+                    return route(*found.groups(), **({"asked": asked} if route in self._asking else {}))
         raise NotFoundError(f"the page has no address {path}", code="page_not_found")
 
     @property
     def _asking(self) -> tuple[Callable[..., Answer], ...]:
         return self._tileset, self._history
+
+    @property
+    def _of_levels(self) -> tuple[Callable[..., Answer], ...]:
+        return self._map, self._state, self._tileset, self._tile, self._overview, self._merged
 
     def content(self) -> ViewMap:
         """Return the current map, read again if it has changed."""
@@ -190,7 +196,7 @@ class Answers:
             self._ahead.join()
 
     def _draw_first_plan(self) -> None:
-        with suppress(Exception):  # the page's own request reports it
+        with suppress(Exception), self._levels.paused():  # the page's own request reports it
             self._plan("0")
 
     def _plan(self, component: str) -> Answer:

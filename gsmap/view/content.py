@@ -191,6 +191,7 @@ class ViewExtent:
     Args:
         corners: (8, 3) corners of an upright box around each scene, the lower four first.
         frame: (8, 3) corners of an upright box around all scenes, in the same order.
+        outline: (K, 3) points around their floor, closer than the box.
         box: (2, 3) box along the axes of the map around all scenes.
         size: Length, width and height of ``frame``.
         has_ceiling: Most of the floor has something above it.
@@ -198,6 +199,7 @@ class ViewExtent:
 
     corners: tuple[np.ndarray, ...]
     frame: np.ndarray
+    outline: np.ndarray
     box: np.ndarray
     size: tuple[float, float, float]
     has_ceiling: bool
@@ -399,6 +401,7 @@ def _overview(one: ViewOverview | None) -> dict[str, Any] | None:
     extent = one.extent
     return data | {
         "frame": None if extent is None else extent.frame.tolist(),
+        "outline": None if extent is None else extent.outline.tolist(),
         "size": None if extent is None else list(extent.size),
         "has_ceiling": extent is not None and extent.has_ceiling,
     }

@@ -7,6 +7,7 @@ import hashlib
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -38,6 +39,7 @@ _STRAYS = 0.02  # fraction of Gaussians left out below the floor, above the ceil
 _CEILING_AT = 0.72  # height from which on there are ceilings, as a fraction of the height from floor to ceiling
 _FLAT = 0.01  # height as a fraction of the width below which a place is flat, without ceilings
 _PER_CELL = 12  # average number of Gaussians in a cell of the plan by which ceilings are found
+_OUTLINE_DIRECTIONS, _OUTLINE_SAMPLE = 16, 20_000  # level directions, and Gaussians, that make an outline
 _FILES_KEPT = 4  # maximum number of overview files in memory
 
 _T = TypeVar("_T")
@@ -71,6 +73,7 @@ def extent_of(parts: Sequence[tuple[ViewScene, Sketch]], up: Sequence[float]) ->
     return ViewExtent(
         corners=tuple(_corners(*upright_box(one, axis, _STRAYS)) for one in points),
         frame=_corners(axes, bounds),
+        outline=_outline(every, axes, bounds[0, 2]),
         box=robust_box(every, None, _STRAYS),
         size=(length, width, height),
         has_ceiling=_has_ceiling(every @ axes.T, bounds),
@@ -81,6 +84,25 @@ def _corners(axes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     """Return the (8, 3) corners of an upright box, the lower four first."""
     corners: np.ndarray = box_corners(bounds) @ axes
     return corners
+
+
+def _outline(points: np.ndarray, axes: np.ndarray, floor: float) -> np.ndarray:
+    """Return points (K, 3) of the floor around all but the outliers in each of several level directions.
+
+    Args:
+        points: (N, 3).
+        axes: (3, 3) rows along the length, the width and up.
+        floor: Height of the floor.
+    """
+    points = points[:: max(1, len(points) // _OUTLINE_SAMPLE)] @ axes.T
+    turns = np.linspace(0, 2 * np.pi, _OUTLINE_DIRECTIONS, endpoint=False)
+    reach = points[:, :2] @ [np.cos(turns), np.sin(turns)]
+    outside = _STRAYS * 4 / _OUTLINE_DIRECTIONS  # as many in all as beyond the four sides of the box
+    inside = (reach <= np.quantile(reach, 1 - outside, axis=0, method="higher")).all(1)
+    found = points[inside][np.unique(reach[inside].argmax(0))]
+    found[:, 2] = floor
+    outline: np.ndarray = found @ axes
+    return outline
 
 
 def _has_ceiling(points: np.ndarray, bounds: np.ndarray) -> bool:
@@ -131,6 +153,10 @@ class Levels:
 
     def close(self) -> None:
         self._maker.close()
+
+    def paused(self) -> AbstractContextManager[None]:
+        """Hold the computation of levels while this context is open: for what a person waits for."""
+        return self._maker.paused()
 
     # --- trees -------------------------------------------------------------------------------------------------------
 

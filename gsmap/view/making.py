@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from gsmap.errors import GsmapError
@@ -51,6 +52,7 @@ class Maker:
         self._jobs: dict[str, _Job] = {}
         self._changed = threading.Condition()
         self._closed = False
+        self._holds = 0
         self._threads = [threading.Thread(target=self._run, daemon=True) for _ in range(workers)]
         for thread in self._threads:
             thread.start()
@@ -87,6 +89,18 @@ class Maker:
         with self._changed:
             return self._changed.wait_for(lambda: self._closed or done(), timeout_s) and done()
 
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Hold the jobs, at their start and at their progress reports, while this context is open."""
+        with self._changed:
+            self._holds += 1
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._holds -= 1
+                self._changed.notify_all()
+
     def close(self) -> None:
         """Stop the threads; running jobs end at their next progress report."""
         with self._changed:
@@ -110,7 +124,7 @@ class Maker:
     def _run(self) -> None:
         while True:
             with self._changed:
-                while not self._closed and (found := self._next()) is None:
+                while not self._closed and (self._holds or (found := self._next()) is None):
                     self._changed.wait()
                 if self._closed:
                     return
@@ -133,6 +147,9 @@ class Maker:
                 self._changed.notify_all()
 
     def _report(self, job: _Job, fraction: float) -> None:
+        if self._holds:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or not self._holds)
         if self._closed:
             raise _ShutdownRequest
         job.progress = fraction

@@ -97,6 +97,7 @@ def made_map(scenes: int = 12, second_island: int = 2, hostile: bool = False) ->
                     "scenes": [],
                     "counts": [],
                     "frame": None,
+                    "outline": None,
                     "has_ceiling": k == 0,
                     "size": [3.0 * (scenes, second_island)[k] - 1, 2, 2],
                 },

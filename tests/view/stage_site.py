@@ -100,7 +100,7 @@ def site(
                  "box": [every.min(0).tolist(), every.max(0).tolist()], "merged": None,
                  "plan": None,
                  "overview": {"uri": "overview.spz", "pending": 0, "scenes": list(range(len(rows))), "counts": counts,
-                              "frame": None, "size": None, "has_ceiling": False}
+                              "frame": None, "outline": None, "size": None, "has_ceiling": False}
                  if overview else None}  # fmt: skip
     edges = [{"target": i, "source": i + 1, "status": "accepted", "used": True, "one_pair": False, "undecided": False,
               "review": None,

@@ -494,6 +494,21 @@ def test_the_map_is_walked_into_and_seen_from_above(hands):
     assert told(hands, "walkIn") == [None]
 
 
+def test_the_floor_plan_stands_in_until_all_is_known_and_where_there_is_no_3d_view(hands, server):
+    server.map["components"][0]["overview"]["pending"] = 3
+    server.map["state"] = "s5"
+    hands.wait("globalThis.fake.calls.filter((call) => call[0] === 'show').length > 1", 20)
+    hands.value("Object.assign(fake.state, { hasStood: false }).hasStood")
+    hands.value("document.getElementById('canvas').dispatchEvent(new Event('drawn'))")
+    hands.wait("find('svg[aria-label=\"Floor plan of the map\"]', null)")
+    hands.click("button", "Show what is there")
+    assert told(hands, "stand") is not None
+    server.map["components"][0]["overview"]["pending"] = 0
+    hands.go(server.url + "?no-webgl")
+    hands.says("no WebGL", "gs-entry")
+    hands.wait("find('svg[aria-label=\"Floor plan of the map\"]', null)")
+
+
 def test_what_one_pair_places_is_called_so(hands, server):
     server.map["edges"][1]["one_pair"] = True
     server.map["scenes"][2]["status"] = "one pair"

@@ -56,7 +56,7 @@ def test_what_is_up_is_what_most_scenes_say():
 def test_a_static_page_promises_nothing_that_is_computed_when_asked():
     view = replace(MadeDoors().view, has_objects=True, merged=frozenset([0]))
     corners, box = box_corners(np.array([[0, 0, 0], [6, 5, 2.5]])), np.array([[0.5, 0, 0], [5, 5, 2]])
-    extent = ViewExtent((corners,), corners, box, (6.0, 5.0, 2.5), True)
+    extent = ViewExtent((corners,), corners, corners[:4], box, (6.0, 5.0, 2.5), True)
     overviews = {0: ViewOverview("o.spz", (0,), (9,), 1, extent)}
     live, still = (summary(view, ServerState(live=live, overviews=overviews)) for live in (True, False))
     assert (live["graph"], live["history"]) == ("graph.json", "history.json")
@@ -65,6 +65,7 @@ def test_a_static_page_promises_nothing_that_is_computed_when_asked():
     assert live["components"][0]["plan"] == "plans/0.json"
     assert still["components"][0]["plan"] is None
     told = {"uri": "o.spz", "pending": 1, "scenes": [0], "counts": [9], "frame": corners.tolist(), "has_ceiling": True}
+    told["outline"] = corners[:4].tolist()
     told["size"] = [6.0, 5.0, 2.5]
     assert still["scenes"][0]["corners"] == corners.tolist()
     whole = {0: replace(overviews[0], pending=0)}

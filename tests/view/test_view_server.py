@@ -291,6 +291,29 @@ def test_a_tree_is_made_when_it_is_asked_for_and_served_in_parts(server, page_so
     assert ask(server, uri)[2] == body
 
 
+def test_levels_wait_while_a_person_waits_for_something_else(server, page_source, monkeypatch):
+    drawing, drawn = threading.Event(), threading.Event()
+    graph = page_source.graph
+
+    def slow() -> dict[str, object]:
+        drawing.set()
+        assert drawn.wait(10)
+        return graph()
+
+    monkeypatch.setattr(page_source, "graph", slow, raising=False)
+    asked = threading.Thread(target=ask, args=(server, "/graph.json"))
+    asked.start()
+    assert drawing.wait(10)
+    tileset = f"/scenes/{page_source.view.scenes[0].key}/tileset.json"
+    end = time.monotonic() + 1
+    while time.monotonic() < end:
+        assert ask(server, tileset)[0] == 202
+        time.sleep(0.05)
+    drawn.set()
+    asked.join()
+    assert told(server, tileset)["root"]
+
+
 def test_a_scene_that_cannot_be_read_is_said(server, page_source):
     def broken(scene):
         raise InputError("scene a is damaged: run gsmap check")

@@ -116,6 +116,13 @@ def test_a_room_is_measured_whatever_its_frame_is_turned(tmp_path):
         np.testing.assert_allclose(own[4:, 2], 2.5, atol=0.01)
         np.testing.assert_allclose(np.ptp(own, axis=0), (6, 3, 2.5), rtol=0.05)
     assert extent.has_ceiling
+    own = extent.outline @ turn
+    np.testing.assert_allclose(own[:, 2], 0, atol=0.01)
+    assert (np.ptp(own, axis=0)[:2] > (5.5, 2.7)).all()
+    bent = replace(blob(2, 4000), means=(np.c_[rng.uniform(0, (6, 3), (4000, 2)), np.zeros(4000)]).astype(np.float32))
+    bent = bent[(bent.means[:, 0] < 3) | (bent.means[:, 1] < 1)]  # a quarter is missing, and the outline cuts across
+    found = extent_of([(ViewScene(scene, "k", None), Sketch(bent, scene.bounds))], [0, 0, 1.0]).outline
+    assert (found[:, 0] + found[:, 1]).max() < 7.2, "less than the corner of the box at 9"
     floor = ViewScene(replace(scene, bounds=scene.bounds), "k", None, up), Sketch(g[:1000], scene.bounds)
     wall = blob(1, 300)
     wall = replace(wall, means=(np.c_[np.zeros(300), rng.uniform(0, (3, 2.5), (300, 2))] @ turn.T).astype(np.float32))

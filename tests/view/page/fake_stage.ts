@@ -1,8 +1,9 @@
 // A 3D view that draws nothing but remembers what it was told: the panels are tested by it in milliseconds.
-import type { Pick, Stage, StageOptions, Standpoint } from "../../../gsmap/view/page/src/stage/stage";
+import type { Pick, Stage, StageOptions, StageState, Standpoint } from "../../../gsmap/view/page/src/stage/stage";
 
 export interface Fake {
   calls: [string, ...unknown[]][];
+  state: StageState;
   pick(pick: Pick): void;
   move(standpoint: Standpoint): void;
   dragTo(matrix: number[][]): void;
@@ -24,8 +25,23 @@ export async function createStage(options: StageOptions): Promise<Stage> {
     (...values: unknown[]) => {
       calls.push([name, ...values.map(plain)]);
     };
+  if (location.search === "?no-webgl") throw new Error("no WebGL");
+  const state: StageState = {
+    phase: "ready",
+    frames: 0,
+    splats: 0,
+    bytesReceived: 0,
+    bytesUploaded: 0,
+    pending: 0,
+    settled: true,
+    error: null,
+    isShown: true,
+    hasStood: true,
+    isAbove: true,
+  };
   const fake: Fake = {
     calls,
+    state,
     pick: options.onPick,
     move: (at) => {
       standpoint = at;
@@ -38,18 +54,7 @@ export async function createStage(options: StageOptions): Promise<Stage> {
   const { canvas } = options;
   canvas.getContext("2d")?.fillText("3D", 10, 20);
   return {
-    state: {
-      phase: "ready",
-      frames: 0,
-      splats: 0,
-      bytesReceived: 0,
-      bytesUploaded: 0,
-      pending: 0,
-      settled: true,
-      error: null,
-      isShown: true,
-      isAbove: true,
-    },
+    state,
     show: (map, component) => calls.push(["show", map.scenes.length, component]),
     setVisible: note("setVisible"),
     setSource: note("setSource"),

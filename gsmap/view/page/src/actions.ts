@@ -1,7 +1,17 @@
 // Everything that a person can do on the page, one function each. What changes the map goes through `send`.
 import { act, getEdge, getGraph, getHistory, getMap, getPlan, getRevision, getState, Gone } from "./api";
 import { fits } from "./address";
-import type { Actions, Box, GraphEntry, MapSummary, Matrix, RevisionPoses, SceneEntry, Vector } from "./contract";
+import type {
+  Actions,
+  Box,
+  FloorPlan,
+  GraphEntry,
+  MapSummary,
+  Matrix,
+  RevisionPoses,
+  SceneEntry,
+  Vector,
+} from "./contract";
 import * as derive from "./derive";
 import { Resources } from "./resources";
 import type { Resource } from "./resources";
@@ -25,6 +35,11 @@ export const histories = new Resources((key) => {
 
 export function graphOf(state: State): Resource<GraphEntry> | null {
   return state.map?.graph ? graphs.get(state.map.graph) : null;
+}
+
+export function planOf(state: State): Resource<FloorPlan> | null {
+  const plan = state.map && derive.componentOf(state.map, state.component)?.plan;
+  return plan ? plans.get(plan) : null;
 }
 
 /** Where everything lay in the revision that is looked at; null for the newest, whose poses the map has. */
@@ -249,6 +264,11 @@ export async function walkIn(): Promise<void> {
   const { map, selection } = page.state;
   const index = selection?.kind === "scene" ? map?.scenes.findIndex((scene) => scene.id === selection.key) : undefined;
   if (!(await page.stage?.walkIn(index))) say("No camera of these scenes is known: W A S D and the mouse walk in");
+}
+
+/** Looks at the 3D view before all of it is there. */
+export function stay(): void {
+  if (page.stage) page.stage.stand(page.stage.standpoint());
 }
 
 export function flyTo(box: Box): void {

@@ -57,6 +57,7 @@ export interface Overview {
   scenes: number[]; // indices into MapSummary.scenes
   counts: number[]; // Gaussians of each
   frame: Vector[] | null; // (8) corners of an upright box around nearly all of it, the lower four first; map frame
+  outline: Vector[] | null; // around nearly all of its floor, closer than that box; map frame
   size: Vector | null; // length, width and height of that box, map units
   has_ceiling: boolean; // from above one would see roofs: most of the floor has something over it
 }

@@ -358,7 +358,7 @@ export class App extends Panel {
           <p><button class="main" @click=${() => void actions.retry()}>Try again</button></p>
         </div>
       </div>`;
-    if (stageError)
+    if (stageError && actions.planOf(this.state)?.status !== "ready")
       return html`<div class="start">
         <div class="card stack" role="alert">
           <h2>The 3D view does not work here</h2>

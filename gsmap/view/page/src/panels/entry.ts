@@ -37,6 +37,7 @@ export class Entry extends CanvasPanel {
         grid-template-rows: minmax(0, 1fr) auto;
         gap: 10px;
         background: var(--ground);
+        pointer-events: auto;
       }
       figure svg {
         width: 100%;
@@ -72,21 +73,24 @@ export class Entry extends CanvasPanel {
 
   @state() private isAbove = false;
   @state() private isDrawn = false;
+  @state() private hasStood = false;
 
   protected readonly drawn = (): void => {
     const known = page.stage?.state;
     this.isAbove = known?.isAbove ?? false;
     this.isDrawn = known?.isShown ?? false;
+    this.hasStood = known?.hasStood ?? false;
   };
 
   protected override render() {
     const { map, component, stageError } = this.state;
     const shown = map && derive.componentOf(map, component);
-    if (!shown || stageError) return nothing;
-    if (!this.isDrawn) {
-      const known = shown.plan ? actions.plans.get(shown.plan) : null;
-      return known?.status === "ready" ? this.plan(known.value) : nothing;
-    }
+    if (!shown) return nothing;
+    const pending = shown.overview?.pending ?? 0;
+    const isComing = !this.isDrawn || (pending > 0 && !this.hasStood);
+    const known = isComing ? actions.planOf(this.state) : null;
+    if (known?.status === "ready") return this.plan(known.value, stageError);
+    if (!this.isDrawn) return nothing;
     if (!shown.overview?.has_ceiling) return nothing;
     return this.isAbove
       ? html`<button class="main way" title="Walk in (i)" @click=${() => void actions.walkIn()}>
@@ -97,7 +101,7 @@ export class Entry extends CanvasPanel {
         </button>`;
   }
 
-  private plan({ picture, size_m: [width, height], scenes }: FloorPlan) {
+  private plan({ picture, size_m: [width, height], scenes }: FloorPlan, error: string | null) {
     const high = (WIDTH * height) / width;
     const at = ([x, y]: [number, number]) => `${(WIDTH * x).toFixed(1)} ${(high * y).toFixed(1)}`;
     const outline = (rings: [number, number][][]) => rings.map((ring) => `M${ring.map(at).join("L")}Z`).join("");
@@ -112,7 +116,14 @@ export class Entry extends CanvasPanel {
         )}
       </svg>
       <figcaption role="status">
-        Floor plan, ${width.toFixed(0)} × ${height.toFixed(0)} m. The 3D view is being prepared.
+        Floor plan, ${width.toFixed(0)} × ${height.toFixed(0)} m.
+        ${
+          error
+            ? html`The 3D view does not work here: ${error} It needs WebGL 2: look whether the browser's hardware
+              acceleration is on. Lists, reviews and pictures work without it.`
+            : "The 3D view is being prepared."
+        }
+        ${this.isDrawn ? html`<button @click=${actions.stay}>Show what is there of it</button>` : nothing}
       </figcaption>
     </figure>`;
   }

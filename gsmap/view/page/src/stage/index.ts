@@ -58,6 +58,7 @@ class View3D implements Stage {
     settled: false,
     error: null,
     isShown: false,
+    hasStood: false,
     isAbove: false,
   };
   private readonly renderer: WebGLRenderer;
@@ -91,7 +92,6 @@ class View3D implements Stage {
   private detail: EdgeDetail | null = null;
   private readonly extras = new Map<string, Promise<SceneExtras | null>>(); // by address, asked for once
   private readonly extrasOf = new Map<string, SceneExtras>(); // those that are there
-  private hasStood = false; // the viewer was put, or went, where they are
   private top = Infinity; // height above which the viewer sees ceilings
   private scheduled = 0;
   private isStale = true; // the order and the colours are another view's
@@ -136,7 +136,7 @@ class View3D implements Stage {
     this.written = map.scenes.map((scene) => new Matrix4().set(...(scene.S_map_scene.flat() as Sixteen)));
     if (isOther) {
       this.isVisibleKnown = false;
-      this.hasStood = false;
+      this.state.hasStood = false;
     }
     if (!this.isVisibleKnown) this.visible = new Set(map.scenes.keys());
     this.dragged = null;
@@ -147,7 +147,9 @@ class View3D implements Stage {
     this.place();
     this.drawOverlays();
     this.cut();
-    if (!this.hasStood) this.fit(undefined, false);
+    // Once, when all bounds are known; at first by what is known, under the floor plan.
+    if (!this.state.hasStood && (isOther || !shown.overview?.pending)) this.fit(undefined, false);
+    this.state.hasStood ||= !shown.overview?.pending;
     this.refresh();
   }
 
@@ -277,13 +279,18 @@ class View3D implements Stage {
     return this.map?.components.find((one) => one.component === this.component);
   }
 
+  /** All of the component is drawn, where its overview was made. */
+  private get isWhole(): boolean {
+    const isSeen = this.map?.scenes.every((_, i) => !this.isInComponent(i) || this.isSeen(i)) ?? false;
+    return isSeen && !this.revision && !this.dragged;
+  }
+
   /** Corners of boxes around all that is drawn. */
   private seenCorners(): Vector3[] {
     const { map, shown } = this;
     const at = (corner: Vector) => new Vector3(...corner);
     const inside = map?.scenes.map((_, i) => i).filter((i) => this.isInComponent(i)) ?? [];
-    const isWhole = inside.every((i) => this.isSeen(i)) && !this.revision && !this.dragged;
-    if (isWhole && shown?.overview?.frame) return shown.overview.frame.map(at);
+    if (this.isWhole && shown?.overview?.frame) return shown.overview.frame.map(at);
     const corners = inside
       .filter((i) => this.isSeen(i))
       .flatMap((i) => map?.scenes[i]?.corners.map((one) => at(one).applyMatrix4(this.movedBy(i))) ?? []);
@@ -318,7 +325,7 @@ class View3D implements Stage {
   // ---- the view ---------------------------------------------------------------------------------------------------
 
   stand(at: Standpoint, fly = false): void {
-    this.hasStood = true;
+    this.state.hasStood = true;
     this.view.stand(at, fly);
   }
 
@@ -328,7 +335,7 @@ class View3D implements Stage {
 
   fit(box?: Box, fly = true): void {
     if (box) {
-      this.hasStood = true;
+      this.state.hasStood = true;
       this.view.fit(
         new Array(8).fill(0).map((_, k) => new Vector3(...cornerOf(box, k))),
         fly,
@@ -338,10 +345,15 @@ class View3D implements Stage {
     let corners = this.seenCorners();
     if (!corners.length) return;
     const { up } = this.view.camera;
-    if (this.shown?.overview?.has_ceiling) {
-      const { at } = this.ceilingOf(corners);
-      corners = corners.map((corner) => corner.clone().addScaledVector(up, Math.min(0, at - corner.dot(up))));
-    }
+    const { at, top } = this.ceilingOf(corners);
+    const highest = this.shown?.overview?.has_ceiling ? at : top;
+    const outline = this.isWhole ? this.shown?.overview?.outline : null;
+    const raised = (point: Vector3, by: number) => point.clone().addScaledVector(up, by);
+    corners = outline
+      ? outline
+          .map((point) => new Vector3(...point))
+          .flatMap((point) => [point, raised(point, highest - point.dot(up))])
+      : corners.map((corner) => raised(corner, Math.min(0, highest - corner.dot(up))));
     this.view.fit(corners, fly, this.acrossFrame());
   }
 
@@ -355,7 +367,7 @@ class View3D implements Stage {
   }
 
   standAtCamera(T_map_camera: Matrix, intrinsics: [number, number, number, number], size: [number, number]): void {
-    this.hasStood = true;
+    this.state.hasStood = true;
     this.view.standAtCamera(T_map_camera, intrinsics, size);
   }
 
@@ -390,7 +402,7 @@ class View3D implements Stage {
     const eye = apexes[best] as Vector3;
     const distance = Math.max(eye.distanceTo(middle), this.view.controls.minDistance * 5);
     const target = eye.clone().addScaledVector(looks[best] as Vector3, distance);
-    this.hasStood = true;
+    this.state.hasStood = true;
     this.view.stand({ position: eye.toArray(), target: target.toArray() }, true);
     return true;
   }
@@ -406,7 +418,7 @@ class View3D implements Stage {
 
   /** The viewer has moved of their own: what comes later does not move them. */
   private readonly onOwnWay = (): void => {
-    this.hasStood = true;
+    this.state.hasStood = true;
   };
 
   private readonly resize = (): void => {
@@ -453,8 +465,8 @@ class View3D implements Stage {
     this.timer.update(now);
     const { camera } = this.view;
     const wasMoving = this.isMoving;
-    // After a rest the clock has gone on; the viewer has not.
-    this.isMoving = this.view.update(wasMoving ? Math.min(0.1, this.timer.getDelta()) : 1 / 60);
+    // Flights go by the clock, however long a picture takes. After a rest the clock has gone on; the viewer has not.
+    this.isMoving = this.view.update(wasMoving ? this.timer.getDelta() : 1 / 60);
     const viewProjection = camera.projectionMatrix.clone().multiply(camera.matrixWorldInverse);
     if (!viewProjection.equals(this.last)) {
       this.last.copy(viewProjection);
@@ -693,7 +705,7 @@ class View3D implements Stage {
 
   private readonly onDown = (event: PointerEvent): void => {
     this.options.canvas.focus({ preventScroll: true });
-    this.hasStood = true;
+    this.state.hasStood = true;
     this.down =
       event.isPrimary && event.button === 0 ? { x: event.clientX, y: event.clientY, id: event.pointerId } : null;
   };

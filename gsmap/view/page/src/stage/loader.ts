@@ -13,9 +13,9 @@ export interface Budget {
   splats: number; // drawn at a time
   bytes: number; // of splats held by the graphics card
   errorPx: number; // what is closer to the originals than this is not refined
-  requests: number; // at a time
+  requests: number; // at a time; browsers open six to a server, and lists and pictures need some of them
 }
-export const BUDGET: Budget = { splats: 2_000_000, bytes: 600 << 20, errorPx: 0.5, requests: 6 };
+export const BUDGET: Budget = { splats: 2_000_000, bytes: 600 << 20, errorPx: 0.5, requests: 4 };
 
 /** What is seen: where the eye is and how large things get. */
 export interface Viewpoint {
@@ -274,7 +274,10 @@ export class Loader {
   private fetchOverview(overview: DrawnOverview): void {
     void this.during(async () => {
       try {
-        const response = await fetch(new URL(overview.of.uri, document.baseURI), { signal: this.aborter.signal });
+        const response = await fetch(new URL(overview.of.uri, document.baseURI), {
+          signal: this.aborter.signal,
+          priority: "low",
+        });
         if (!response.ok) throw new Error(`the overview: ${response.status} ${response.statusText}`);
         const bytes = new Uint8Array(await response.arrayBuffer());
         this.bytesReceived += bytes.length;

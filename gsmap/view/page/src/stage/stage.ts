@@ -38,6 +38,7 @@ export interface StageState {
   settled: boolean; // nothing more to load, sort or draw for this standpoint
   error: string | null;
   isShown: boolean; // some splats have been drawn
+  hasStood: boolean; // the viewer was put, or went, where they are
   isAbove: boolean; // the viewer is higher than all that is drawn: ceilings are left out
 }
 

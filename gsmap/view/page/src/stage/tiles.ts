@@ -165,7 +165,7 @@ export async function fetchTileset(
 ): Promise<{ json: unknown } | { retry_s: number }> {
   const ask = new URL(url, document.baseURI);
   if (rank > 0) ask.searchParams.set("rank", String(rank));
-  const response = await fetch(ask, { signal });
+  const response = await fetch(ask, { signal, priority: "low" });
   if (!response.ok) throw new Error(`${ask.pathname}: ${response.status} ${response.statusText}`);
   if (response.status === 202) return { retry_s: Math.max(0.2, ((await response.json()) as TreeProgress).retry_s) };
   return { json: await response.json() };
@@ -179,7 +179,7 @@ export interface Content {
 
 /** The splats of a GLB. */
 export async function fetchContent(url: string, signal: AbortSignal): Promise<Content> {
-  const response = await fetch(url, { signal });
+  const response = await fetch(url, { signal, priority: "low" });
   if (!response.ok) throw new Error(`${new URL(url).pathname}: ${response.status} ${response.statusText}`);
   const bytes = new Uint8Array(await response.arrayBuffer());
   const { spz, floats, matrix } = readGlb(bytes, url);

@@ -23,7 +23,7 @@ const FIELD_DEG = 60;
 const STEP = 0.08; // of the distance to what is looked at, for one key
 const TURN = Math.PI / 36;
 const ELEVATION = (68 * Math.PI) / 180; // of the viewer over what is seen whole
-const FILL = 0.97; // of the view, by what is seen whole
+const FILL = 0.99; // of the view, by what is seen whole
 
 export class View {
   readonly camera = new PerspectiveCamera(FIELD_DEG, 1, 0.01, 1000);
@@ -123,11 +123,19 @@ export class View {
 
   /**
    * Sees points whole, obliquely from above, as large as they fit.
-   * @param aside level direction in which the viewer stands; else any
+   * @param aside level direction in which the viewer stands, or its opposite, from where they are larger; else any
    */
   fit(points: readonly Vector3[], fly: boolean, aside?: Vector3): void {
-    const up = this.camera.up;
+    const { up } = this.camera;
     const side = aside ?? new Vector3(Math.abs(up.x) < 0.9 ? 1 : 0, Math.abs(up.x) < 0.9 ? 0 : 1, 0).cross(up);
+    const ways = [side, side.clone().negate()].slice(0, aside ? 2 : 1).map((one) => this.wholeFrom(points, one));
+    const [best] = ways.sort((a, b) => a.distance - b.distance);
+    if (best) this.stand({ position: best.eye.toArray(), target: best.target.toArray() }, fly);
+  }
+
+  /** Where one stands on a side to see points whole. */
+  private wholeFrom(points: readonly Vector3[], side: Vector3) {
+    const { up } = this.camera;
     const forward = side.normalize().multiplyScalar(-Math.cos(ELEVATION)).addScaledVector(up, -Math.sin(ELEVATION));
     const right = forward.clone().cross(up).normalize();
     const above = right.clone().cross(forward);
@@ -146,8 +154,7 @@ export class View {
     const [x, y] = [along(right, half * this.camera.aspect), along(above, half)];
     const distance = Math.max(x.distance, y.distance, this.controls.minDistance);
     const target = middle.addScaledVector(right, x.shift).addScaledVector(above, y.shift);
-    const eye = target.clone().addScaledVector(forward, -distance);
-    this.stand({ position: eye.toArray(), target: target.toArray() }, fly);
+    return { distance, target, eye: target.clone().addScaledVector(forward, -distance) };
   }
 
   private ahead(pose: Matrix4): Vector3 {
