@@ -15,6 +15,8 @@ from gsmap.types.source import gathered
 
 # A Gaussian this many times wider than the scene is not a background; it is a broken file.
 MAX_SCALE_OVER_EXTENT = 1e4
+# Skies and backgrounds lie within this many times the extent of 99 % of the Gaussians; strays lie beyond.
+MAX_EXTENT_RATIO = 1e3
 # No camera takes larger pictures, and a JPEG holds none; views are rendered at the size of a camera's picture.
 MAX_SIDE_PX = 65_535
 _SAMPLE = 20_000
@@ -47,6 +49,7 @@ def validate_gaussians(gaussians: GaussianSource, where: str) -> tuple[str, ...]
     sampled = []
     start, step = 0, _step(n)
     opacities, scales = 0, 0
+    corners = []
     for chunk in map(clamp_infinities, gaussians.chunks()):
         infinite = count_clamped(chunk)
         opacities, scales = opacities + infinite[0], scales + infinite[1]
@@ -60,18 +63,27 @@ def validate_gaussians(gaussians: GaussianSource, where: str) -> tuple[str, ...]
         bad["a rotation quaternion of zero"].note(start, (chunk.quats == 0).all(1))
         widest[start : start + len(chunk)] = chunk.log_scales.max(1)
         sampled.append(chunk.means[-start % step :: step])
+        corners += [chunk.means.min(0), chunk.means.max(0)]
         start += len(chunk)
     for what, found in bad.items():
         found.refuse(where, what)
     absurd = _BadRows()
     absurd.note(0, _is_oversized(widest, np.concatenate(sampled)))
     absurd.refuse(where, f"a scale of more than {MAX_SCALE_OVER_EXTENT:g} extents of the capture")
-    if not opacities and not scales:
-        return ()
-    return (
-        f"{opacities} opacities are 0 or 1 and {scales} scales are 0, whose logits or logarithms are infinite: "
-        "they were replaced by finite numbers that look the same",
-    )
+    notes = []
+    if opacities or scales:
+        notes.append(
+            f"{opacities} opacities are 0 or 1 and {scales} scales are 0, whose logits or logarithms are infinite: "
+            "they were replaced by finite numbers that look the same"
+        )
+    middle = np.ptp(np.percentile(np.concatenate(sampled), [0.5, 99.5], axis=0).astype(np.float64), axis=0).max()
+    whole = np.ptp(np.array(corners, np.float64), axis=0).max()
+    if whole > MAX_EXTENT_RATIO * middle > 0:
+        notes.append(
+            f"a few Gaussians lie far away: the capture is {whole:.3g} units wide, 99 % of it {middle:.3g}; "
+            "--clean removes them"
+        )
+    return tuple(notes)
 
 
 def invalid_rows(gaussians: Gaussians) -> np.ndarray:

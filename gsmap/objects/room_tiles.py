@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -19,6 +20,8 @@ TILE_M = 32.0
 """Edge of a tile of the floor plan."""
 HALO_M = 16.0
 """Width of the surroundings that are segmented with a tile; larger rooms are cut."""
+
+_MAX_BOX_TILES = 1024  # 1 km x 1 km; the tiles of a larger scene are found from its points, which must be loaded
 
 Tile = tuple[int, int]
 
@@ -46,13 +49,7 @@ def update_rooms(
     if is_small(boxes.values()):
         whole = np.array([[-np.inf] * 2, [np.inf] * 2])
         return order_rooms(_rooms_within(whole, boxes, load, eyes, min_area_m2))
-    tiles = {
-        (int(x), int(y))
-        for box in boxes.values()
-        for low, high in [np.floor(box[:, :2] / TILE_M)]
-        for x in np.arange(low[0], high[0] + 1)
-        for y in np.arange(low[1], high[1] + 1)
-    }
+    tiles = {tile for scene, box in boxes.items() for tile in _tiles(box, partial(load, scene))}
     touched = sorted(tile for tile in tiles if changed is None or _meets(_window(tile), changed))
     left = tiles.difference(touched) if changed is not None else set[Tile]()  # tiles without scenes have no rooms
     stay = [room for room in earlier if _tile_of(room) in left]
@@ -72,6 +69,16 @@ def is_small(boxes: Iterable[np.ndarray]) -> bool:
     return bool((every[:, 1, :2].max(0) - every[:, 0, :2].min(0)).max() <= TILE_M + 2 * HALO_M)
 
 
+def _tiles(box: np.ndarray, load: Callable[[], SurfacePoints]) -> set[Tile]:
+    """Return the tiles of a box (2, 3); if it has too many, as around stray Gaussians, the tiles of its points."""
+    low, high = np.floor(box[:, :2] / TILE_M)
+    if np.prod(high - low + 1) > _MAX_BOX_TILES:
+        cells = np.unique(np.floor(load().points[:, :2] / TILE_M), axis=0)
+    else:
+        cells = np.stack(np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high, strict=True))), -1).reshape(-1, 2)
+    return {(int(x), int(y)) for x, y in cells.tolist()}
+
+
 def _rooms_within(
     bounds: np.ndarray,
     boxes: Mapping[str, np.ndarray],
@@ -87,7 +94,7 @@ def _rooms_within(
 
 
 def _window(tile: Tile) -> np.ndarray:
-    low = np.array(tile) * TILE_M
+    low = np.array(tile, dtype=np.float64) * TILE_M
     return np.array([low - HALO_M, low + TILE_M + HALO_M])
 
 

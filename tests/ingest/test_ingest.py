@@ -296,6 +296,13 @@ def test_infinities_that_are_values_are_clamped_at_every_door(tmp_path, suffix):
         assert all(np.isfinite(column).all() for column in capture.content.columns(name))
 
 
+def test_stray_gaussians_far_away_are_noted():
+    means = box().means.copy()
+    assert not validate(replaced(box(), means=means))
+    means[17, 1] = 1e7
+    assert any("--clean" in note for note in validate(replaced(box(), means=means)))
+
+
 def test_absurd_values_are_refused_with_their_row():
     scales = box().log_scales.copy()
     scales[3, 1] = np.log(1e6)

@@ -160,6 +160,16 @@ def test_a_new_room_segments_only_the_tiles_around_it():
     assert plan(rooms(range(30), updated, [])) == plan(updated)
 
 
+@pytest.mark.parametrize("far_m", [1e7, 1e30])
+def test_a_stray_point_far_away_changes_no_room(far_m):
+    some = {str(k): walls(k) for k in range(15)}
+    stray = np.concatenate([some["3"].points, np.full((1, 3), far_m, np.float32)])
+    some["3"] = SurfacePoints(stray, np.append(some["3"].is_level, False))
+    boxes = {scene: one.box for scene, one in some.items()}
+    found = update_rooms(boxes, some.__getitem__, lambda scene: np.array([[5.0 * int(scene) + 2.5, 2, 1.5]]), 1.5)
+    assert plan(found) == plan(rooms(range(15)))
+
+
 @pytest.mark.guards("answers")
 def test_rooms_of_a_scene_that_goes_go_with_it():
     """Four buildings 40 m apart; the last one leaves tiles without a scene."""
