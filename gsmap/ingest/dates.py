@@ -31,13 +31,16 @@ _DATE = re.compile(
     r"""(?: (?<!\d) (?P<y>\d{4}) (?P<s>[-_]) (?P<m>\d\d) (?P=s) (?P<d>\d\d) (?!\d)
           | (?<![A-Za-z0-9.]) (?P<day>\d{8}) (?![0-9A-SU-Za-z])
           | (?<=[A-Za-z][-_]) (?P<stamp>\d{14}) (?![0-9A-Za-z]) )
-        (?: (?: [T_\ ] (?!\d{4}[-_]\d\d[-_]\d\d)  # another date is no time
+        (?: (?: (?:(?P<T>T)|[_\ ]) (?!\d{4}[-_]\d\d[-_]\d\d)  # another date is no time
               | - (?=\d\d[-_:]\d\d[-_:]\d\d(?!\d) | \d{6}(?:\d{3})?(?!\d)) )
             (?P<h>\d\d) (?P<t>[-_:]?) (?P<min>\d\d) (?: (?P=t) (?P<sec>\d\d) (?: (?<=\d{6}) (?P<ms>\d{3}) )? )?
-            (?P<z>Z|\+\d\d:?\d\d)? (?![0-9A-Za-z]) )?
+            (?: \.\d{1,9} (?=Z|[-+]\d\d) )?
+            (?P<z> Z | \+\d\d(?::?\d\d)? | -\d\d:\d\d  # -0700 after 140000 or 14:00, not after 14-00-00
+              | (?(T)(?<=[\d:]\d\d)-(?:0\d|1[0-2])(?:00|30|45)|(?!)) )? (?![0-9A-Za-z]) )?
     """,
     re.VERBOSE | re.ASCII,
 )
+_ZONE_OR_NUMBER = re.compile(r"-(?:0\d|1[0-2])(?:00|30|45)(?![0-9A-Za-z])", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -334,6 +337,8 @@ def _matched(match: re.Match[str]) -> tuple[datetime, str] | None:
                 microsecond=1000 * milliseconds,
             )
             note = "" if match["z"] else "no zone was given, so UTC was assumed"
+            if not match["z"] and (unread := _ZONE_OR_NUMBER.match(match.string, match.end())) is not None:
+                note = f"{unread[0]} may be a number and was not read as a zone, so UTC was assumed"
             date = datetime.fromisoformat(date.isoformat() + (match["z"] or ""))
         except ValueError:  # a number that follows, and no time
             date, note = datetime.strptime(day, "%Y%m%d"), "no time of day was given, so 00:00 UTC was assumed"
