@@ -427,6 +427,7 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
     "no_ray": ("No two photos show the control point.", r"no two photos show it"),
     # Captures that are not thinned.
     "fidelity_too_low": ("Thinning would change the capture's pictures too much.", r"compact, its pictures would"),
+    "pose_unconfirmed": ("The capture's pose is not confirmed.", r"its pose is not confirmed"),
     "seen_too_little": ("Newer captures observed too little of the capture.", r"newer captures that stay whole saw"),
     # Anything else.
     "other": ("Another reason.", r""),

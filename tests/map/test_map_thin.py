@@ -1,6 +1,7 @@
 """Thinning through the door: which captures may go compact, and what a dry run changes."""
 
 import sys
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -58,6 +59,20 @@ def test_no_capture_stands_for_another_that_goes_itself(tmp_path):
             nearest = min(abs(starts[int(k)] - starts[int(scene.name[1:])]) for k in whole if k >= int(scene.name[1:]))
             assert nearest <= 0.6, f"nothing stands for {scene.name}"
         assert len(whole) > 1
+
+
+@pytest.mark.parametrize("doubtful", [0, 2])
+def test_a_pose_that_is_not_confirmed_thins_nothing(tmp_path, doubtful):
+    with walls(tmp_path / "m.gsmap", [0.0, 0.0, 0.0]) as m:
+        graph = m.store.revisions.get()
+        poses = dict(graph.poses)
+        scene = m.scenes()[doubtful].id
+        poses[scene] = replace(poses[scene], status="tentative")
+        m.store.revisions.save(replace(graph, poses=poses))
+        report = m.thin(keep_days=0, now=NOW)
+        codes = {row.scene_name: row.reason_code for row in report.scenes}
+        assert codes[f"w{doubtful}"] == "pose_unconfirmed"
+        assert [row.scene_name for row in report.scenes if row.thinned] == ["w1" if doubtful == 0 else "w0"]
 
 
 def test_no_capture_stands_for_one_of_another_component(tmp_path):

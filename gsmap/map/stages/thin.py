@@ -45,8 +45,9 @@ class Request:
 def thin(store: Store, request: Request, settings: Settings, progress: StageProgress) -> ThinReport:
     """Thin superseded scenes, the oldest first, and reclaim the space.
 
-    A capture is superseded where newer ones, dated and kept whole, looked at nearly all of its surface: they stand for
-    it when a new capture is registered or a picture localised. Poses, registrations and words stay.
+    A placed capture is superseded where newer ones, also placed, dated and kept whole, looked at nearly all of its
+    surface: they stand for it when a new capture is registered or a picture localised. Poses, registrations and words
+    stay.
 
     Raises:
         ConfigError: neither days nor a budget, or negative ones; the clock contradicts what is stored.
@@ -68,12 +69,16 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
         raise ConfigError(
             f"no date lies {request.keep_days:g} days before today: pass fewer days", code="date_out_of_range"
         ) from error
-    known = [scene for scene in dated if scene.id in graph.poses]
+    # Thinning cannot be undone, so a pose that nothing confirms is not enough.
+    sure = {scene for scene, pose in graph.poses.items() if pose.status == "placed"}
+    known = [scene for scene in dated if scene.id in (sure if scene.thinning is None else graph.poses)]
+    doubtful = [s for s in dated if s.thinning is None and s.id not in sure and _when(s) < before]
     of_scenes, of_graphs = scene_sizes(store), graph_sizes(store)
     sizes = {scene: of_scenes.get(scene, 0) + of_graphs.get(scene, 0) for scene in living}
     ups = {graph.scene: graph.up for graph in store.graphs.frames()}  # of the newest graph
     shares = _superseded(store, known, before, graph, settings, progress)
-    rows: list[ThinRow] = []
+    why = reason("pose_unconfirmed", "its pose is not confirmed: gsmap list MAP scenes shows its status")
+    rows = [_row(scene, sizes[scene.id], sizes[scene.id], 0.0, why) for scene in doubtful]
     with note_interruption(lambda: f"{sum(row.thinned for row in rows)} captures are thinned"):
         for done, scene in enumerate(scene for scene in known if scene.id in shares):
             if request.budget_bytes is not None and sum(sizes.values()) <= request.budget_bytes:
@@ -105,7 +110,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
     progress("thin", 1.0, f"{sum(row.thinned for row in rows)} thinned")
     return ThinReport(
         dry_run=request.dry_run,
-        scenes=tuple(rows),
+        scenes=tuple(sorted(rows, key=lambda row: _moment(row.captured_at))),
         num_undated=len(living) - len(dated),
         num_bytes=sum(sizes.values()),
         num_bytes_freed=freed,
