@@ -50,9 +50,13 @@ def status(store: Store, settings: Settings) -> MapStatus:
     )
     pairs = store.registrations.current_keys()
     registered = {scene for pair, _ in pairs if living.issuperset(ends := pair.split(":")) for scene in ends}
+    unregistered = living - registered if len(scenes) > 1 else set[str]()
+    if unregistered:
+        counts = store.graphs.node_counts()
+        unregistered = {scene for scene in unregistered if counts.get(scene) != 0}  # without nodes no pair is proposed
     add(
         "unregistered",
-        len(living - registered) if len(scenes) > 1 else 0,
+        len(unregistered),
         update,
         "scenes that were never registered with another",
     )
@@ -168,7 +172,7 @@ def _add_unsolved(store: Store, settings: Settings, add: Callable[[TodoKind, int
     newest = store.revisions.newest()
     if not given.scenes or (newest is not None and newest.key == given.key.digest):
         return
-    if newest is not None and newest.recipe != given.key.recipe:
+    if newest is not None and newest.recipe not in (None, given.key.recipe):  # poses that a merge joined have none
         add("stale_poses", 1, verb, "poses solved by other settings or another version")
     else:
         add("unsolved", 1, verb, "scenes, edges, reviews, priors or observations newer than the poses")

@@ -157,6 +157,19 @@ def test_other_settings_make_other_graphs_and_edges_and_going_back_adopts_the_fi
     assert watched.todo().keys() <= {"tentative", "one_pair"}
 
 
+def test_status_distinguishes_poses_without_a_recipe_and_scenes_without_nodes(
+    watched: Watched, captures: list[DemoCapture]
+) -> None:
+    m = watched.map
+    m.store.revisions.save(m.store.revisions.get())  # as a merge does, which joins the poses of two maps
+    assert "stale_poses" not in watched.todo()
+    assert watched.todo()["unsolved"] == 1
+    m.ingest(captures[0].gaussians[np.arange(5)], cameras=captures[0].cameras, name="bare")
+    m.describe()
+    assert m.store.graphs.node_counts()[m.scenes()[-1].id] == 0
+    assert "unregistered" not in watched.todo()
+
+
 def test_settings_of_register_leave_the_graphs(watched: Watched) -> None:
     m = watched.map
     graphs, edge = watched.graph_keys(), watched.edge_key()
