@@ -37,18 +37,23 @@ def command(
 
     The command reads the catalog and the files to send; if one of them is damaged, it saves nothing. A branch whose
     catalog is damaged is left out, and no older snapshot is deleted. Files that were damaged after they had been sent
-    are found by `gsmap check`, and the backup keeps their sound bytes. Exit code 1 if a branch was left out, or if
-    `--verify` finds damage in the backup that the map cannot repair. For S3, set `AWS_ACCESS_KEY_ID`,
-    `AWS_SECRET_ACCESS_KEY`, `AWS_REGION` and `AWS_ENDPOINT_URL`.
+    are found by `gsmap check`, and the backup keeps their sound bytes. Exit code 1 if a branch was left out, if
+    `--verify` finds damage that the map cannot repair, or if `--list` finds a damaged snapshot. For S3, set
+    `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, `AWS_REGION` and `AWS_ENDPOINT_URL`.
 
     Example: `gsmap backup site.gsmap /mnt/backup/site --keep 30`
     """
     if list:
-        from gsmap.map import snapshots
+        from gsmap.map.backups import snapshots
 
         if verify or keep is not None:
             raise typer.BadParameter("--list cannot be combined with --verify or --keep")
-        print_rows("backup --list", snapshots(dest), json, "snapshots")
+        rows, problems = snapshots(dest)
+        print_rows("backup --list", rows, json, "snapshots")
+        for problem in problems:
+            say(problem)
+        if problems:
+            raise typer.Exit(1)
         return
     with opened(map, bars=True) as m:
         report = m.backup(dest, verify=verify, keep=keep)

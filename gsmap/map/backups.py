@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from datetime import UTC, datetime
 
-from gsmap.errors import ConfigError
+from gsmap.errors import ConfigError, CorruptError
 from gsmap.ingest import parse_date
 from gsmap.store import Store, schema
 from gsmap.store import backup as _backup
@@ -31,13 +31,20 @@ def save(
     )
 
 
-def snapshots(target: str | os.PathLike[str]) -> list[SnapshotRow]:
-    """List the snapshots of a backup, oldest first.
+def snapshots(target: str | os.PathLike[str]) -> tuple[list[SnapshotRow], list[str]]:
+    """Return the sound snapshots of a backup, oldest first, and one message per damaged snapshot.
 
     Raises:
         NotFoundError, StoreError: see `gsmap.store.backup.Backup.open`.
     """
-    return [snapshot_row(one) for one in _backup.Backup.open(target).snapshots()]
+    backup = _backup.Backup.open(target)
+    rows, problems = list[SnapshotRow](), list[str]()
+    for name in backup.names():
+        try:
+            rows.append(snapshot_row(backup.snapshot(name)))
+        except CorruptError as error:
+            problems.append(str(error))
+    return rows, problems
 
 
 def restore(

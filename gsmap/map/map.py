@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -13,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmap.engine import WorkerSession
-from gsmap.errors import ConfigError, NotFoundError, SchemaVersionError
+from gsmap.errors import ConfigError, NotFoundError, SchemaVersionError, StoreError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
 from gsmap.map.metric_scales import metres_at
 from gsmap.map.progress_logging import log_progress
-from gsmap.map.shared_jobs import announce_work
+from gsmap.map.shared_jobs import announce_work, explain_purges
 from gsmap.store import Store
 from gsmap.texts import counted
 from gsmap.types import Cameras, Change, Gaussians, PoseGraph, Prior, Scene, SceneGraph, ScenePose, Sim3
@@ -80,7 +81,13 @@ def open(path: str | os.PathLike[str], progress: StageProgress | None = None) ->
 
 def open_or_create(path: str | os.PathLike[str], progress: StageProgress | None = None) -> Map:
     """Open a map, or create it if it is missing."""
-    return open(path, progress) if Store.exists(path) else create(path, progress)
+    if not Store.exists(path):
+        try:
+            return create(path, progress)
+        except StoreError as error:
+            if error.code != "already_exists" or not Store.exists(path):
+                raise  # otherwise another process has just created it
+    return open(path, progress)
 
 
 def migrate(path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
@@ -113,10 +120,13 @@ def restore(
 
 
 def snapshots(target: str | os.PathLike[str]) -> Table[SnapshotRow]:
-    """List the snapshots of a backup (``gsmap backup MAP DEST --list``), oldest first."""
+    """List the sound snapshots of a backup (``gsmap backup MAP DEST --list``), oldest first; log damaged ones."""
     from gsmap.map import backups
 
-    return Table(backups.snapshots(target))
+    rows, problems = backups.snapshots(target)
+    for problem in problems:
+        logging.getLogger("gsmap.map").warning("%s", problem)
+    return Table(rows)
 
 
 def accept_catalog(path: str | os.PathLike[str]) -> list[str]:
@@ -383,13 +393,15 @@ class Map(AbstractContextManager["Map"]):
         before = reports.history_position(self.store)
         with announce_work(self.store, "update"):
             ingested = self.ingest(*captures, captured_at=captured_at, clean=clean) if captures else []
-            describe(self.store, unthinned(self.store.scenes.summaries()), self.settings, self._progress)
-            known = RegisteredPairs()
-            register(self.store, "auto", self.settings, self._progress, known)
-            # Poses may tell of new neighbours, and their edges of new poses.
-            while solve(self.store, self.settings, self._progress):
-                if not register(self.store, "auto", self.settings, self._progress, known):
-                    break
+            scenes = self.store.scenes.summaries()
+            with explain_purges(self.store, scenes):
+                describe(self.store, unthinned(scenes), self.settings, self._progress)
+                known = RegisteredPairs()
+                register(self.store, "auto", self.settings, self._progress, known)
+                # Poses may tell of new neighbours, and their edges of new poses.
+                while solve(self.store, self.settings, self._progress):
+                    if not register(self.store, "auto", self.settings, self._progress, known):
+                        break
         return reports.update_report(self.store, ingested, before, self.metres)
 
     def set_prior(self, prior: Prior) -> PriorRow | None:

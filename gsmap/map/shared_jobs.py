@@ -13,8 +13,9 @@ from contextlib import closing, contextmanager, suppress
 from typing import Any
 
 from gsmap.engine import QuarantinedJob, is_beginning
-from gsmap.errors import ConfigError, GsmapError
+from gsmap.errors import ConfigError, DiskError, DiskFullError, GsmapError, StoreError
 from gsmap.store import Store
+from gsmap.store.scenes import SceneSummary
 from gsmap.types.progress import StageProgress
 
 _log = logging.getLogger("gsmap.map")
@@ -251,3 +252,19 @@ def note_interruption(kept: Callable[[], str]) -> Iterator[None]:
         if not isinstance(stopped, (Exception, GeneratorExit)):
             stopped.add_note(kept())
         raise
+
+
+@contextmanager
+def explain_purges(store: Store, scenes: Sequence[SceneSummary]) -> Iterator[None]:
+    """Raise `StoreError` in place of an error if another process has purged some of the scenes."""
+    try:
+        yield
+    except GsmapError as error:
+        left = store.scenes.names()
+        gone = [scene.name for scene in scenes if scene.id not in left]
+        if not gone or isinstance(error, (DiskError, DiskFullError)):
+            raise
+        raise StoreError(
+            f"another process purged {', '.join(gone[:3])} meanwhile: run the same command again",
+            code="changed_meanwhile",
+        ) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import stat
@@ -157,7 +158,12 @@ class Store:
             (staged / "arrays").mkdir()
             _make_catalog(staged, catalog_url)
             sync_folder(staged)
-            os.rename(staged, folder)
+            try:
+                os.rename(staged, folder)
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
+                raise StoreError(f"{path} was made by another process meanwhile", code="already_exists") from error
             sync_folder(folder.parent)
         if catalog_url is not None:
             trust.trust_new_map(folder)

@@ -42,6 +42,12 @@ def test_a_map_comes_back_as_it_was(site: Path, tmp_path: Path, cli: Run) -> Non
     assert cli("restore", dest, tmp_path / "r3.gsmap").code == 0
     assert len(cli("list", tmp_path / "r3.gsmap", "scenes", "--json").json["scenes"]) == 2
 
+    newest = max((tmp_path / "my backup" / "snapshots").iterdir())
+    newest.write_bytes(newest.read_bytes()[:-9])
+    damaged = cli("backup", site, dest, "--list", "--json")
+    assert (damaged.code, damaged.json["snapshots"]) == (1, listed[:1])
+    assert newest.name in damaged.stderr
+
 
 def test_what_goes_wrong_is_one_line(site: Path, tmp_path: Path, cli: Run) -> None:
     assert cli("backup", site, tmp_path / "b").code == 0

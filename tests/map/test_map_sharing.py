@@ -14,8 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from raising import raises
 
 import gsmap.map
+from gsmap.errors import StoreError
+from gsmap.store.revisions import Revisions
 from gsmap.types import Cameras, Gaussians
 
 ROOT = Path(__file__).parents[2]
@@ -39,6 +42,23 @@ def site(tmp_path: Path) -> Path:
             gaussians = Gaussians(means, quats, np.full((50, 3), -3.0), np.zeros(50), sh)
             m.ingest(gaussians, cameras=cameras, name=f"scene{i}", scale="known")
     return tmp_path / "site.gsmap"
+
+
+def test_a_scene_purged_by_another_process_during_an_update_is_named(site, monkeypatch):
+    save = Revisions.save
+
+    def save_after_a_purge(self, *args, **kwargs):
+        monkeypatch.undo()
+        with gsmap.map.open(site) as other:
+            other.purge("scene0")
+        return save(self, *args, **kwargs)
+
+    monkeypatch.setattr(Revisions, "save", save_after_a_purge)
+    with gsmap.map.open(site) as m:
+        with raises(StoreError, code="changed_meanwhile", match="scene0"):
+            m.update()
+        m.update()
+        assert len(m.scenes()) == NUM_SCENES - 1
 
 
 @pytest.fixture

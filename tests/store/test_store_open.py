@@ -7,6 +7,8 @@ import pytest
 from raising import raises
 from store_samples import make_cameras, make_gaussians
 
+import gsmap.map
+import gsmap.store.store as store_module
 from gsmap.errors import BusyError, ConfigError, CorruptError, NotFoundError, SchemaVersionError, StoreError
 from gsmap.store import Store, page_digests, schema
 
@@ -33,6 +35,24 @@ def test_create_refuses_what_is_there(tmp_path):
         Store.create(tmp_path / "none" / "a")
     (tmp_path / "empty").mkdir()
     Store.create(tmp_path / "empty").close()
+
+
+def test_a_map_made_by_another_process_meanwhile_is_opened(tmp_path, monkeypatch):
+    make_catalog, made = store_module._make_catalog, []
+
+    def another_first(staged, url):
+        make_catalog(staged, url)
+        if not made:
+            made.append(True)
+            Store.create(tmp_path / f"{len(list(tmp_path.glob('?.gsmap')))}.gsmap").close()
+
+    monkeypatch.setattr(store_module, "_make_catalog", another_first)
+    with raises(StoreError, code="already_exists"):
+        Store.create(tmp_path / "0.gsmap")
+    made.clear()
+    with gsmap.map.open_or_create(tmp_path / "1.gsmap") as m:
+        assert not m.scenes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["0.gsmap", "1.gsmap"]
 
 
 def test_open_refuses_what_is_no_map(tmp_path):

@@ -176,7 +176,8 @@ class Backup:
         text = _read(self.storage, f"{SNAPSHOTS}{name}.json", 1 << 20)
         if hashlib.sha256(text).hexdigest()[:16] != name[-16:]:
             raise CorruptError(
-                f"{where} is damaged: restore an earlier snapshot, and delete this one", code="backup_damaged"
+                f"{where} is damaged: restore another snapshot (--list shows them), and delete this one",
+                code="backup_damaged",
             )
         data = _object(text, where)
         kinds: dict[str, Any] = {"revision": int | None, "counts": dict}
@@ -189,10 +190,6 @@ class Backup:
         if found.time != name[: -len("Z-") - 16]:
             raise CorruptError(f"the time in {where} differs from the time in its name", code="backup_damaged")
         return found
-
-    def snapshots(self) -> list[Snapshot]:
-        """Load all snapshots, oldest first."""
-        return [self.snapshot(name) for name in self.names()]
 
     def find(self, name: str | None = None, *, at: str | None = None) -> Snapshot:
         """Load the newest snapshot, or the requested one.
