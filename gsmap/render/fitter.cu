@@ -5,7 +5,7 @@
 // before. Backwards a warp takes 64 places of the lists, wherever their tiles begin and end, from the transmittance that
 // blending left there, so that long lists are not waited for. Compiled by NVRTC when it is first used.
 
-constexpr int WARP = 32, TILE = 16, BLOCK = 8, BUCKET = 64, MOMENTS = 9, REACH = 5, TAPS = 11;
+constexpr int WARP = 32, TILE = 16, BLOCK = 8, BUCKET = 64, FEW = 16, MOMENTS = 9, REACH = 5, TAPS = 11;
 constexpr int HUBER = 0, SIMILAR = 1, WEIGHT = 2, LOSS = 3, OVERFLOW = 4;  // of the sums of a view
 constexpr unsigned ALL = 0xffffffffu;
 constexpr float LN2 = 0.693147180559945309f, LOG2_255 = 7.99435343685886f;
@@ -285,16 +285,35 @@ extern "C" __global__ void list_tiles(const Step *step, const float4 *records, c
     if (total > capacity) return;
     for (long long at = total + rank; at < capacity; at += (long long)gridDim.x * blockDim.x)
         write(at, narrow ? 32767 : 2147483647, 0);
-    if (rank >= n) return;
-    const int id = int(order[rank]);
-    if (!counts[id]) return;
-    const Record g = load(records, id);
-    long long at = upto[rank] - counts[id];
-    int begin, end, first;
-    rows_of_tiles(g, step->tiles_y, begin, end);
-    for (int row = begin; row < end; row++) {
-        const int count = row_of_tiles(g, row, step->tiles_x, first);
-        for (int i = 0; i < count; i++, at++) write(at, row * step->tiles_x + first + i, id);
+    const int lane = threadIdx.x % WARP, id = rank < n ? int(order[rank]) : 0, mine = rank < n ? counts[id] : 0;
+    const long long from = rank < n ? upto[rank] - mine : 0;
+    if (mine && mine <= FEW) {
+        const Record g = load(records, id);
+        long long at = from;
+        int begin, end, first;
+        rows_of_tiles(g, step->tiles_y, begin, end);
+        for (int row = begin; row < end; row++) {
+            const int count = row_of_tiles(g, row, step->tiles_x, first);
+            for (int i = 0; i < count; i++, at++) write(at, row * step->tiles_x + first + i, id);
+        }
+    }
+    // A large Gaussian is listed by the whole warp, a row of tiles by each lane.
+    for (unsigned large = __ballot_sync(ALL, mine > FEW); large; large &= large - 1) {
+        const int owner = __ffs(large) - 1, of = int(order[rank - lane + owner]);
+        const Record g = load(records, of);
+        long long at = upto[rank - lane + owner] - counts[of];
+        int begin, end, first = 0;
+        rows_of_tiles(g, step->tiles_y, begin, end);
+        for (int row = begin + lane; row - lane < end; row += WARP) {
+            const int count = row < end ? row_of_tiles(g, row, step->tiles_x, first) : 0;
+            int upto_row = count;  // of this and the rows before it
+            for (int by = 1; by < WARP; by *= 2) {
+                const int before = __shfl_up_sync(ALL, upto_row, by);
+                if (lane >= by) upto_row += before;
+            }
+            for (int i = 0; i < count; i++) write(at + upto_row - count + i, row * step->tiles_x + first + i, of);
+            at += __shfl_sync(ALL, upto_row, WARP - 1);
+        }
     }
 }
 
@@ -352,21 +371,21 @@ extern "C" __global__ void blend(const Step *step, const Options *options, const
         y[p] = y0 + lane / BLOCK + 4 * p;
         alive[p] = wanted && x < view.width && y[p] < view.height;
     }
-    const int start = starts[tile], end = starts[tile + 1];
-    for (int base = start / WARP * WARP; base < end; base += WARP) {
+    const int start = starts[tile], end = starts[tile + 1], begin = start / WARP * WARP;
+    // Records are read a round ahead and their numbers two rounds, so that no round waits for memory.
+    const auto listed_at = [&](int at) { return at >= start && at < end ? listed[at] : -1; };
+    int id = listed_at(begin + lane), next_id = listed_at(begin + WARP + lane);
+    Record g{}, next{};
+    if (id >= 0) g = load(records, id);
+    for (int base = begin; base < end; base += WARP, id = next_id, g = next, next_id = listed_at(base + WARP + lane)) {
         if (!__any_sync(ALL, alive[0] || alive[1])) break;
         if (base % BUCKET == 0 && base > start)
             for (int p = 0; p < 2; p++)
                 checkpoints[base / BUCKET * (TILE * TILE) + warp * (2 * WARP) + p * WARP + lane] =
                     {t[p], c[p][0], c[p][1], c[p][2]};
-        const int at = base + lane;
-        bool hit = false;
-        if (at >= start && at < end) {
-            const int id = listed[at];
-            const Record g = load(records, id);
-            hit = touches(g, x0, y0);
-            if (hit) kept[warp][lane] = g, ids[warp][lane] = id;
-        }
+        if (next_id >= 0) next = load(records, next_id);
+        const bool hit = id >= 0 && touches(g, x0, y0);
+        if (hit) kept[warp][lane] = g, ids[warp][lane] = id;
         unsigned hits = __ballot_sync(ALL, hit);
         __syncwarp();
         for (; hits; hits &= hits - 1) {
@@ -425,8 +444,8 @@ extern "C" __global__ void blend_backward(const Step *step, const float4 *record
                                           int plane, const int *last, const int *block_last, const float4 *checkpoints,
                                           float *moments, const float *sums) {
     if (sums[OVERFLOW] != 0.f) return;
-    __shared__ Record kept[4][WARP];
-    __shared__ int ids[4][WARP], where[4][WARP];
+    __shared__ Record kept[4][BUCKET];
+    __shared__ int ids[4][BUCKET], where[4][BUCKET];
     const int warp = threadIdx.x / WARP, lane = threadIdx.x % WARP;
     const Step &view = *step;
     const int total = starts[view.tiles_x * view.tiles_y], begin = blockIdx.x * BUCKET;
@@ -434,22 +453,23 @@ extern "C" __global__ void blend_backward(const Step *step, const float4 *record
     int tile = -1, x = 0, y[2] = {}, final[2] = {-1, -1};
     float t[2], rest[2], v[2][3];
     bool looked_at = false;
-    for (int base = begin; base < begin + BUCKET && base < total; base += WARP) {
-        const int at = base + lane;
-        bool hit = false;
-        if (at < total) {
-            const int own = narrow ? ((const short *)tiles)[at] : ((const int *)tiles)[at];
-            if (at <= block_last[4 * own + warp]) {
-                const int id = listed[at];
-                const Record g = load(records, id);
-                hit = touches(g, own % view.tiles_x * TILE + warp % 2 * BLOCK, own / view.tiles_x * TILE + warp / 2 * BLOCK);
-                if (hit) kept[warp][lane] = g, ids[warp][lane] = id, where[warp][lane] = own;
-            }
-        }
-        unsigned hits = __ballot_sync(ALL, hit);
-        __syncwarp();
-        for (; hits; hits &= hits - 1) {
-            const int k = __ffs(hits) - 1;
+    unsigned hits[BUCKET / WARP];
+    for (int half = 0; half < BUCKET / WARP; half++) {
+        const int place = half * WARP + lane, at = begin + place;
+        const bool there = at < total;
+        const int own = !there ? 0 : narrow ? ((const short *)tiles)[at] : ((const int *)tiles)[at];
+        const int id = there ? listed[at] : 0;
+        Record g{};
+        bool hit = there && at <= block_last[4 * own + warp];
+        if (there) g = load(records, id);
+        hit = hit && touches(g, own % view.tiles_x * TILE + warp % 2 * BLOCK, own / view.tiles_x * TILE + warp / 2 * BLOCK);
+        if (hit) kept[warp][place] = g, ids[warp][place] = id, where[warp][place] = own;
+        hits[half] = __ballot_sync(ALL, hit);
+    }
+    __syncwarp();
+    for (int half = 0; half < BUCKET / WARP; half++) {
+        for (unsigned left = hits[half]; left; left &= left - 1) {
+            const int k = half * WARP + __ffs(left) - 1;
             if (where[warp][k] != tile) {
                 tile = where[warp][k];
                 x = tile % view.tiles_x * TILE + warp % 2 * BLOCK + lane % BLOCK;
@@ -482,7 +502,7 @@ extern "C" __global__ void blend_backward(const Step *step, const float4 *record
             for (int p = 0; p < 2; p++) {
                 const float dy = y[p] + 0.5f - g.y, u = g.l11 * dx + g.l12 * dy, w = g.l22 * dy;
                 const float exponent = g.log2_opacity - u * u - w * w;
-                if (base + k > final[p] || exponent < -LOG2_255) continue;
+                if (begin + k > final[p] || exponent < -LOG2_255) continue;
                 some = true;
                 const float raw = power_of_two(exponent), alpha = fminf(raw, MAX_ALPHA), weight = alpha * t[p];
                 const float value = g.r * v[p][0] + g.g * v[p][1] + g.b * v[p][2];
@@ -498,7 +518,6 @@ extern "C" __global__ void blend_backward(const Step *step, const float4 *record
             const int of = lane == 1 ? 8 : lane / 4;
             if (lane % 4 == 0 || lane == 1) atomicAdd(moments + (long long)ids[warp][k] * MOMENTS + of, sum);
         }
-        __syncwarp();
     }
 }
 

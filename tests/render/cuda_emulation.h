@@ -118,15 +118,18 @@ inline void run(unsigned grid, unsigned size, std::function<void()> kernel) {
 
 inline void __syncthreads() { emulation::meet(emulation::block, emulation::current, 0); }
 inline void __syncwarp() { emulation::meet(emulation::warp(), emulation::lane(), 0); }
-template <class T> T __shfl_xor_sync(unsigned, T value, int step) {
+template <class T> T from_lane(T value, int lane) {
     static_assert(sizeof(T) == 4);
     uint32_t bits;
     std::memcpy(&bits, &value, 4);
     emulation::Meeting &warp = emulation::warp();
     const int side = emulation::meet(warp, emulation::lane(), bits);
-    std::memcpy(&value, &warp.values[side][emulation::lane() ^ step], 4);
+    if (lane >= 0) std::memcpy(&value, &warp.values[side][lane], 4);
     return value;
 }
+template <class T> T __shfl_xor_sync(unsigned, T value, int step) { return from_lane(value, emulation::lane() ^ step); }
+template <class T> T __shfl_up_sync(unsigned, T value, int step) { return from_lane(value, emulation::lane() - step); }
+template <class T> T __shfl_sync(unsigned, T value, int lane) { return from_lane(value, lane); }
 inline unsigned __ballot_sync(unsigned, bool value) {
     emulation::Meeting &warp = emulation::warp();
     const int side = emulation::meet(warp, emulation::lane(), value);
