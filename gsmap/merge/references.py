@@ -10,13 +10,13 @@ import numpy as np
 
 from gsmap.geometry.boxes import inside
 from gsmap.geometry.projection import in_image, project
+from gsmap.geometry.threads import map_ahead
 from gsmap.merge import photos
 from gsmap.merge.changes import ResolvedScenes, newest_first
 from gsmap.merge.overlap import share_in_view
 from gsmap.merge.reference_view_cache import surface_axes
 from gsmap.merge.sharpness import Compared, SharpnessComparison, SharpnessWeights, compared_views
 from gsmap.render import ChunkIndex, Rendering, render
-from gsmap.render.threads import in_order
 from gsmap.types import Cameras, Gaussians, PosedScene
 from gsmap.types.progress import Progress
 
@@ -179,7 +179,7 @@ def render_references(
         image, weight = np.round(colour * 255).astype(np.uint8), np.round(np.clip(weight, 0, 1) * 255).astype(np.uint8)
         return i, counted, _View(camera, image, weight, share, _coarse_points(camera, depth), parts)
 
-    for done, (i, counted, view) in enumerate(in_order(look, enumerate(todo))):
+    for done, (i, counted, view) in enumerate(map_ahead(look, enumerate(todo))):
         progress(done / len(todo), "rendering reference views")
         if counted is not None:
             pixels[i] += counted.pixels
