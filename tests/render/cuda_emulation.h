@@ -146,6 +146,7 @@ inline bool __syncthreads_or(bool value) {
     return false;
 }
 inline bool __any_sync(unsigned all, bool value) { return __ballot_sync(all, value) != 0; }
+inline int __popc(unsigned value) { return __builtin_popcount(value); }
 inline int __ffs(unsigned value) { return __builtin_ffs(int(value)); }
 inline int __float_as_int(float value) {
     int out;
