@@ -10,6 +10,8 @@ from typing import TypeVar
 
 from gsmap._native import num_threads
 
+_MOST = 4  # more threads wait for Python's lock: with 16, describing and merging are slower than with 4
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -21,9 +23,10 @@ def map_ahead(
 
     Args:
         items: taken by the calling thread, at most two for each thread before their results.
-        threads: 1 runs the function in the calling thread; None takes the number of threads of native kernels.
+        threads: 1 runs the function in the calling thread; None takes as many as native kernels
+            have, at most `_MOST`.
     """
-    threads = num_threads() if threads is None else threads
+    threads = min(num_threads(), _MOST) if threads is None else threads
     if threads == 1:
         yield from map(function, items)
         return

@@ -5,7 +5,7 @@
 // before. Backwards a warp takes 64 places of the lists, wherever their tiles begin and end, from the transmittance that
 // blending left there, so that long lists are not waited for. Compiled by NVRTC when it is first used.
 
-constexpr int WARP = 32, TILE = 16, BLOCK = 8, BUCKET = 64, AT_ONCE = 4, MOMENTS = 9, REACH = 5, TAPS = 11;
+constexpr int WARP = 32, TILE = 16, BLOCK = 8, BUCKET = 64, MOMENTS = 9, REACH = 5, TAPS = 11;
 constexpr int HUBER = 0, SIMILAR = 1, WEIGHT = 2, LOSS = 3, OVERFLOW = 4;  // of the sums of a view
 constexpr unsigned ALL = 0xffffffffu;
 constexpr float LN2 = 0.693147180559945309f, LOG2_255 = 7.99435343685886f;
@@ -14,9 +14,6 @@ constexpr float MAX_ALPHA = 0.99f, MIN_TRANSMITTANCE = 1e-4f, NEAR = 0.01f, DILA
 
 #ifndef SHARED_FLOATS
 #define SHARED_FLOATS(name) extern __shared__ float name[]  // as many as the launch says
-#endif
-#ifndef FEW_TILES
-#define FEW_TILES 128  // so many a thread lists alone
 #endif
 #ifndef NUM_SH
 #define NUM_SH num_sh  // coefficients for each channel; a constant where the compiler is told it
@@ -288,35 +285,16 @@ extern "C" __global__ void list_tiles(const Step *step, const float4 *records, c
     if (total > capacity) return;
     for (long long at = total + rank; at < capacity; at += (long long)gridDim.x * blockDim.x)
         write(at, narrow ? 32767 : 2147483647, 0);
-    const int lane = threadIdx.x % WARP, id = rank < n ? int(order[rank]) : 0, mine = rank < n ? counts[id] : 0;
-    const long long from = rank < n ? upto[rank] - mine : 0;
-    if (mine && mine <= FEW_TILES) {
-        const Record g = load(records, id);
-        long long at = from;
-        int begin, end, first;
-        rows_of_tiles(g, step->tiles_y, begin, end);
-        for (int row = begin; row < end; row++) {
-            const int count = row_of_tiles(g, row, step->tiles_x, first);
-            for (int i = 0; i < count; i++, at++) write(at, row * step->tiles_x + first + i, id);
-        }
-    }
-    // A large Gaussian is listed by the whole warp, a row of tiles by each lane.
-    for (unsigned large = __ballot_sync(ALL, mine > FEW_TILES); large; large &= large - 1) {
-        const int owner = __ffs(large) - 1, of = int(order[rank - lane + owner]);
-        const Record g = load(records, of);
-        long long at = upto[rank - lane + owner] - counts[of];
-        int begin, end, first = 0;
-        rows_of_tiles(g, step->tiles_y, begin, end);
-        for (int row = begin + lane; row - lane < end; row += WARP) {
-            const int count = row < end ? row_of_tiles(g, row, step->tiles_x, first) : 0;
-            int upto_row = count;  // of this and the rows before it
-            for (int by = 1; by < WARP; by *= 2) {
-                const int before = __shfl_up_sync(ALL, upto_row, by);
-                if (lane >= by) upto_row += before;
-            }
-            for (int i = 0; i < count; i++) write(at + upto_row - count + i, row * step->tiles_x + first + i, of);
-            at += __shfl_sync(ALL, upto_row, WARP - 1);
-        }
+    if (rank >= n) return;
+    const int id = int(order[rank]);
+    if (!counts[id]) return;
+    const Record g = load(records, id);
+    long long at = upto[rank] - counts[id];
+    int begin, end, first;
+    rows_of_tiles(g, step->tiles_y, begin, end);
+    for (int row = begin; row < end; row++) {
+        const int count = row_of_tiles(g, row, step->tiles_x, first);
+        for (int i = 0; i < count; i++, at++) write(at, row * step->tiles_x + first + i, id);
     }
 }
 
@@ -360,7 +338,7 @@ extern "C" __global__ void blend(const Step *step, const Options *options, const
                                  int *block_last, float4 *checkpoints, float *max_weight, const float *sums) {
     if (sums[OVERFLOW] != 0.f) return;
     __shared__ Record kept[4][WARP];
-    __shared__ int ids[4][WARP], places[4][WARP];
+    __shared__ int ids[4][WARP];
     const int tile = blockIdx.x, warp = threadIdx.x / WARP, lane = threadIdx.x % WARP;
     const Step &view = *step;
     if (tile >= view.tiles_x * view.tiles_y) return;
@@ -374,53 +352,43 @@ extern "C" __global__ void blend(const Step *step, const Options *options, const
         y[p] = y0 + lane / BLOCK + 4 * p;
         alive[p] = wanted && x < view.width && y[p] < view.height;
     }
-    const int start = starts[tile], end = starts[tile + 1], begin = start / WARP * WARP;
-    // Records are read a round ahead and their numbers two rounds, so that no round waits for memory.
-    const auto listed_at = [&](int at) { return at >= start && at < end ? listed[at] : -1; };
-    int id = listed_at(begin + lane), next_id = listed_at(begin + WARP + lane);
-    Record g{}, next{};
-    if (id >= 0) g = load(records, id);
-    for (int base = begin; base < end; base += WARP, id = next_id, g = next, next_id = listed_at(base + WARP + lane)) {
+    const int start = starts[tile], end = starts[tile + 1];
+    for (int base = start / WARP * WARP; base < end; base += WARP) {
         if (!__any_sync(ALL, alive[0] || alive[1])) break;
         if (base % BUCKET == 0 && base > start)
             for (int p = 0; p < 2; p++)
                 checkpoints[base / BUCKET * (TILE * TILE) + warp * (2 * WARP) + p * WARP + lane] =
                     {t[p], c[p][0], c[p][1], c[p][2]};
-        if (next_id >= 0) next = load(records, next_id);
-        const bool hit = id >= 0 && touches(g, x0, y0);
-        const unsigned hits = __ballot_sync(ALL, hit);
-        const int count = __popc(hits), place = __popc(hits & ((1u << lane) - 1));
-        if (hit) kept[warp][place] = g, ids[warp][place] = id, places[warp][place] = base + lane;
+        const int at = base + lane;
+        bool hit = false;
+        if (at >= start && at < end) {
+            const int id = listed[at];
+            const Record g = load(records, id);
+            hit = touches(g, x0, y0);
+            if (hit) kept[warp][lane] = g, ids[warp][lane] = id;
+        }
+        unsigned hits = __ballot_sync(ALL, hit);
         __syncwarp();
-        // What does not depend on the transmittance is computed for several Gaussians at once.
-        for (int first = 0; first < count; first += AT_ONCE) {
-            float alpha[AT_ONCE][2];
-            for (int k = 0; k < AT_ONCE; k++) {
-                const Record &one = kept[warp][first + k < count ? first + k : first];
-                const float dx = x + 0.5f - one.x;
-                for (int p = 0; p < 2; p++) {
-                    const float dy = y[p] + 0.5f - one.y, u = one.l11 * dx + one.l12 * dy, w = one.l22 * dy;
-                    const float exponent = one.log2_opacity - u * u - w * w;
-                    alpha[k][p] = exponent >= -LOG2_255 ? fminf(power_of_two(exponent), MAX_ALPHA) : 0.f;
+        for (; hits; hits &= hits - 1) {
+            const int k = __ffs(hits) - 1;
+            const Record &g = kept[warp][k];
+            const float dx = x + 0.5f - g.x;
+            float most = 0.f;
+            for (int p = 0; p < 2; p++) {
+                const float dy = y[p] + 0.5f - g.y, u = g.l11 * dx + g.l12 * dy, w = g.l22 * dy;
+                const float exponent = g.log2_opacity - u * u - w * w;
+                if (!alive[p] || exponent < -LOG2_255) continue;
+                const float alpha = fminf(power_of_two(exponent), MAX_ALPHA), weight = alpha * t[p], rest = t[p] - weight;
+                if (!(rest > MIN_TRANSMITTANCE)) {  // who would fall to 1e-4 stops before
+                    alive[p] = false;
+                    continue;
                 }
+                c[p][0] += weight * g.r, c[p][1] += weight * g.g, c[p][2] += weight * g.b;
+                t[p] = rest, final[p] = base + k, most = fmaxf(most, weight);
             }
-            for (int k = 0; k < AT_ONCE && first + k < count; k++) {
-                const Record &one = kept[warp][first + k];
-                float most = 0.f;
-                for (int p = 0; p < 2; p++) {
-                    const float weight = alpha[k][p] * t[p], rest = t[p] - weight;
-                    if (!alive[p] || alpha[k][p] == 0.f) continue;
-                    if (!(rest > MIN_TRANSMITTANCE)) {  // who would fall to 1e-4 stops before
-                        alive[p] = false;
-                        continue;
-                    }
-                    c[p][0] += weight * one.r, c[p][1] += weight * one.g, c[p][2] += weight * one.b;
-                    t[p] = rest, final[p] = places[warp][first + k], most = fmaxf(most, weight);
-                }
-                if (statistics) {
-                    for (int step = WARP / 2; step; step /= 2) most = fmaxf(most, __shfl_xor_sync(ALL, most, step));
-                    if (lane == 0 && most > 0.f) atomicMax((int *)max_weight + ids[warp][first + k], __float_as_int(most));
-                }
+            if (statistics) {
+                for (int step = WARP / 2; step; step /= 2) most = fmaxf(most, __shfl_xor_sync(ALL, most, step));
+                if (lane == 0 && most > 0.f) atomicMax((int *)max_weight + ids[warp][k], __float_as_int(most));
             }
         }
         __syncwarp();

@@ -124,12 +124,10 @@ template <class T> T from_lane(T value, int lane) {
     std::memcpy(&bits, &value, 4);
     emulation::Meeting &warp = emulation::warp();
     const int side = emulation::meet(warp, emulation::lane(), bits);
-    if (lane >= 0) std::memcpy(&value, &warp.values[side][lane], 4);
+    std::memcpy(&value, &warp.values[side][lane], 4);
     return value;
 }
 template <class T> T __shfl_xor_sync(unsigned, T value, int step) { return from_lane(value, emulation::lane() ^ step); }
-template <class T> T __shfl_up_sync(unsigned, T value, int step) { return from_lane(value, emulation::lane() - step); }
-template <class T> T __shfl_sync(unsigned, T value, int lane) { return from_lane(value, lane); }
 inline unsigned __ballot_sync(unsigned, bool value) {
     emulation::Meeting &warp = emulation::warp();
     const int side = emulation::meet(warp, emulation::lane(), value);
@@ -146,7 +144,6 @@ inline bool __syncthreads_or(bool value) {
     return false;
 }
 inline bool __any_sync(unsigned all, bool value) { return __ballot_sync(all, value) != 0; }
-inline int __popc(unsigned value) { return __builtin_popcount(value); }
 inline int __ffs(unsigned value) { return __builtin_ffs(int(value)); }
 inline int __float_as_int(float value) {
     int out;

@@ -6,7 +6,6 @@
 
 static float shared_floats[1 << 16];
 #define SHARED_FLOATS(name) float *name = shared_floats
-#define FEW_TILES 4
 #include "blending_weights.cu"
 #include "fitter.cu"
 
