@@ -248,6 +248,7 @@ export class Time extends Panel {
                   ><span class="anywhere">${scene.name}</span
                   ><input
                     type="date"
+                    min="1970-01-01"
                     aria-label="Date of ${scene.name}"
                     ?disabled=${this.state.busy !== null}
                     @change=${(event: Event) => this.setDate(scene, event.target as HTMLInputElement)}
@@ -259,8 +260,9 @@ export class Time extends Panel {
     </div>`;
   }
 
-  private setDate(scene: SceneEntry, { value }: HTMLInputElement): void {
-    if (value) void actions.setDate(scene, value);
+  private setDate(scene: SceneEntry, { value, validity }: HTMLInputElement): void {
+    // While a year is typed its first digits are a year, too, before the earliest that is allowed.
+    if (value && validity.valid) void actions.setDate(scene, value);
   }
 
   private readonly row = (change: ChangeEntry) => {
