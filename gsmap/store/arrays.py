@@ -35,10 +35,10 @@ from gsmap.durable import (
     sync_file,
     sync_folder,
 )
-from gsmap.errors import CorruptError
+from gsmap.errors import CorruptError, StoreError
 from gsmap.store import array_archive, layout
 from gsmap.store.column_types import KINDS, is_digest
-from gsmap.store.error_translation import translate_errors
+from gsmap.store.error_translation import display_name, translate_errors
 from gsmap.store.layout import CHUNK_ROWS
 
 _PIECE_BYTES = 1 << 20
@@ -239,6 +239,10 @@ class Arrays:
                     f"{path} is not a regular file (it is a link, pipe or device); gsmap creates none: remove it",
                     code="not_a_plain_file",
                 )
+            if found is None and not self.root.parent.is_dir():
+                raise StoreError(
+                    f"{display_name(self.root.parent)} was moved or deleted while it was open", code="changed_meanwhile"
+                )
             if found is None or found.st_size != file.size_bytes:
                 raise CorruptError(
                     f"{path} is missing or truncated: {layout.repair_advice(kind)}", code="arrays_missing"
@@ -325,7 +329,8 @@ class Arrays:
     def _make_staging(self) -> None:
         self._check_root()
         refuse_links(self.root, self.staging.name)
-        self.staging.mkdir(parents=True, exist_ok=True)
+        self.root.mkdir(exist_ok=True)  # not its parents: a map that was moved must not be begun anew
+        self.staging.mkdir(exist_ok=True)
 
     def _remove_staged(self, name: str) -> None:
         remove_tree(self.root.parent, self.root.name, self.staging.name, name)

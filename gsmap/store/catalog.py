@@ -44,12 +44,14 @@ class Catalog:
     ) -> None:
         self.folder = folder
         self._read_only_message = (
-            read_only_message or f"{display_name(folder)} was opened for reading: open it with mode 'w' to change it"
+            read_only_message
+            or f"{display_name(folder)} is open for reading only (read-only disk, missing permission, or mode 'r')"
         )
         self.engine = engine
         self.writable = writable
         self.patience_s = patience_s
         self._thread = threading.local()
+        self._folder_id = _id_of(folder)
 
     @property
     def is_sqlite(self) -> bool:
@@ -174,7 +176,7 @@ class Catalog:
         """Hold the map's writer lock; reentrant within a thread. The kernel frees it when a process dies.
 
         Raises:
-            StoreError: the map was opened for reading.
+            StoreError: the map was opened for reading, or its folder was moved or replaced since.
             BusyError: another process kept the lock for ``patience_s``.
         """
         if not self.writable:
@@ -187,6 +189,12 @@ class Catalog:
             with self._server_lock(advisory_locks.WRITER, patience_s), self._locked():
                 yield
             return
+        if _id_of(self.folder) != self._folder_id:
+            # SQLite would write to the catalog where it is now, and arrays would go to the old path.
+            raise StoreError(
+                f"{display_name(self.folder)} was moved, replaced or deleted while it was open: open it again",
+                code="changed_meanwhile",
+            )
         try:
             handle = os.open(self.folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
         except OSError as error:
@@ -330,7 +338,7 @@ class Catalog:
             return
         file = self.folder / sqlite.FILE
         try:
-            if self.writable and fold:
+            if self.writable and fold and _id_of(self.folder) == self._folder_id:
                 with contextlib.suppress(BusyError), self.lock(patience_s=0.0):
                     self._fold(at_bytes=1)
                     sqlite.dispose(self.engine, file, tidy=True)
@@ -372,6 +380,15 @@ def commit(connection: Connection, transaction: RootTransaction) -> None:
     except BaseException:
         connection.invalidate()
         raise
+
+
+def _id_of(folder: Path) -> tuple[int, int] | None:
+    """Return the device and inode of a folder; None if it is missing."""
+    try:
+        found = os.stat(folder)
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def open_engine(folder: Path, *, writable: bool) -> Engine:

@@ -1,3 +1,4 @@
+import os
 import sqlite3
 import subprocess
 import sys
@@ -53,6 +54,24 @@ def test_a_map_made_by_another_process_meanwhile_is_opened(tmp_path, monkeypatch
     with gsmap.map.open_or_create(tmp_path / "1.gsmap") as m:
         assert not m.scenes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["0.gsmap", "1.gsmap"]
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_map_that_is_moved_while_open_is_not_written(tmp_path, replaced):
+    with Store.create(tmp_path / "a.gsmap") as store:
+        scene, _ = store.scenes.add(make_gaussians(seed=1), make_cameras(), name="y")
+        os.rename(tmp_path / "a.gsmap", tmp_path / "b.gsmap")
+        with raises(StoreError, code="changed_meanwhile"):
+            store.scenes.gaussians(scene.id)
+        if replaced:
+            Store.create(tmp_path / "a.gsmap").close()
+        with raises(StoreError, code=("changed_meanwhile", "system_refused")):
+            store.scenes.add(make_gaussians(), make_cameras(), name="x")
+        with raises(StoreError, code="changed_meanwhile"):
+            store.leases.try_hold("x", "y")
+    assert (tmp_path / "a.gsmap").exists() is replaced
+    with Store.open(tmp_path / "b.gsmap", "r") as store:
+        assert [one.id for one in store.scenes.list()] == [scene.id]
 
 
 def test_open_refuses_what_is_no_map(tmp_path):
