@@ -179,7 +179,7 @@ export class Time extends Panel {
         changes.length
           ? html`<gs-listing
               label="Changes"
-              rem="3.7"
+              rem="4.7"
               .items=${changes}
               .keyOf=${(one: ChangeEntry) => one.id}
               .row=${this.row}
@@ -267,16 +267,17 @@ export class Time extends Panel {
 
   private readonly row = (change: ChangeEntry) => {
     const { map } = this.state;
+    const [before, after] = [map?.scenes[change.before], map?.scenes[change.after]];
     return html`<span role="gridcell" class="wide"
       ><button class="choose" @click=${() => actions.select({ kind: "change", key: change.id })}>
         <span class="name"
           ><gs-kind of=${change.kind}></gs-kind> ${CHANGE_WORDS[change.kind] ?? change.kind}
-          <span class="muted">${percent(change.confidence)}</span></span
+          <span class="muted"
+            >${percent(change.confidence)}${change.status === "open" ? nothing : `, ${change.status}`}</span
+          ></span
         >
-        <span class="detail"
-          ><span>${map ? pairText(map, change.before, change.after) : nothing}</span
-          ><span>${change.status === "open" ? nothing : change.status}</span></span
-        >
+        <span class="detail"><span>${before?.name} →</span><span>${day(before?.captured_at ?? null)}</span></span>
+        <span class="detail"><span>${after?.name}</span><span>${day(after?.captured_at ?? null)}</span></span>
       </button></span
     >`;
   };
