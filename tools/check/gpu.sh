@@ -60,6 +60,7 @@ tail -n "${TESTS_LINES:-25}" "$out/tests.log"
 declare -A limit=([kernels]=90 [fit]=60 [merge]=60 [describe]=70 [pairs]=170 [tile]=120 [memory]=60)
 for part in "${@:-kernels fit merge describe pairs tile memory}"; do
     for one in $part; do
+        [ -n "${limit[$one]:-}" ] || { say "no part is called $one: ${!limit[*]}"; exit 2; }
         seconds=$(left)
         [ "$seconds" -gt 5 ] || { say "$one: not run, the budget is spent"; continue; }
         [ "$seconds" -lt "${limit[$one]}" ] || seconds=${limit[$one]}
