@@ -329,7 +329,8 @@ class Arrays:
     def _make_staging(self) -> None:
         self._check_root()
         refuse_links(self.root, self.staging.name)
-        self.root.mkdir(exist_ok=True)  # not its parents: a map that was moved must not be begun anew
+        if not self.root.is_dir():
+            self.root.mkdir(exist_ok=True)  # not its parents: a map that was moved must not be begun anew
         self.staging.mkdir(exist_ok=True)
 
     def _remove_staged(self, name: str) -> None:
