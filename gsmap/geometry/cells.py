@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from gsmap._native import cell_means as native_cell_means
 from gsmap._native import ranks
-from gsmap.geometry.boxes import box_around
 
 
 def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Label equal rows of integer cell coordinates (N, 3).
+    """Label equal rows of integer cell coordinates (N, D).
 
     Returns:
-        The (N,) int64 labels, from 0 in the order of the cells (x, then y, then z), and the number of rows of each
+        The (N,) int64 labels, from 0 in the order of the cells (first coordinate first), and the number of rows of each
         label.
     """
-    cells = np.asarray(cells).astype(np.int64)
     if not len(cells):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    low, high = box_around(cells)
-    cells, sides = cells - low, high - low + 1
-    if np.prod(sides, dtype=np.float64) >= 2.0**62:  # with extreme outliers one integer per cell would overflow
-        _, label, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    columns = [np.asarray(column).astype(np.int64) for column in cells.T]  # contiguous
+    low = [int(column.min()) for column in columns]
+    sides = [int(column.max()) - first + 1 for column, first in zip(columns, low, strict=True)]
+    if math.prod(sides) >= 2**62:  # with extreme outliers one integer per cell would overflow
+        _, label, counts = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True, return_counts=True)
         return label.reshape(-1), counts
-    key = (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
-    labels, counts = ranks(np.ascontiguousarray(key))
+    key = columns[0] - low[0]
+    for column, first, side in zip(columns[1:], low[1:], sides[1:], strict=True):
+        key *= side
+        key += column
+        key -= first
+    labels, counts = ranks(key)
     return labels, counts
 
 
