@@ -67,19 +67,20 @@ def find_segments(gaussians: Gaussians, cloud: PointCloud, up: np.ndarray | None
     of = members[rows]
     means = gaussians.means[rows].astype(np.float64)
     colours = srgb_to_lab(np.clip(rgb_of_sh0(gaussians.sh[rows, 0]), 0.0, 1.0))
-    order = np.argsort(of, kind="stable")
-    parts = np.split(order, np.searchsorted(of[order], np.arange(1, count))) if count else []
-    ordered, starts = means[order], np.searchsorted(of[order], np.arange(count))
+    sizes = np.bincount(of, minlength=count)
+    starts = np.cumsum(sizes) - sizes
+    order = np.argsort(of.astype(np.uint16) if count < 2**16 else of, kind="stable")  # short keys are sorted by digits
+    ordered, parts = means[order], np.split(colours[order], starts[1:]) if count else []
     # One sample per cell suffices for the shape of a segment.
-    cells = np.floor(means * unit_m / _SAMPLE_M).astype(np.int64)
-    labels, counts = cell_labels(np.column_stack([of, cell_labels(cells)[0], np.zeros(len(rows), np.int64)]))
+    cells = np.floor(means * unit_m / _SAMPLE_M)
+    labels, counts = cell_labels(np.column_stack([of, cell_labels(cells)[0]]))
     of_cell = np.empty(len(counts), np.int64)
     of_cell[labels] = of
     return Segments(
         members,
-        group_means(means, of, np.bincount(of, minlength=count)),
+        group_means(means, of, sizes),
         np.stack([bound.reduceat(ordered, starts) if count else ordered for bound in (np.minimum, np.maximum)], axis=1),
-        np.array([np.median(colours[p], axis=0) for p in parts]).reshape(-1, 3),
+        np.array([np.median(part, axis=0) for part in parts]).reshape(-1, 3),
         group_means(means, labels, counts),
         group_means(colours.astype(np.float64), labels, counts),
         np.bincount(of_cell, minlength=count),
@@ -160,16 +161,8 @@ class _Surface:
     ) -> None:
         self.points, self.lab, self.areas, self.structure = points, lab, areas, structure
         self.count = len(points)
-        self.neighbours = neighbours
-        self.a = np.repeat(np.arange(self.count), neighbours.shape[1] - 1)
-        self.b = neighbours[:, 1:].ravel()
-        self.length = distances[:, 1:].ravel()
-        spacing = distances[:, 8] / 1.6  # the eighth neighbour of points that lie evenly on a plane
-        reach = _LINK * np.minimum(spacing[self.a], spacing[self.b])
-        near = self.length < np.clip(reach, _LINK_MIN_M, _LINK_MAX_M)
-        rank = np.tile(np.arange(neighbours.shape[1] - 1), self.count)
-        self.linked = near & (rank < _LINKED)
-        self.near = near
+        self.distances, self.neighbours = distances, neighbours
+        self.spacing = distances[:, 8] / 1.6  # the eighth neighbour of points that lie evenly on a plane
 
     def labels(self) -> np.ndarray:
         """Return the (N,) segment of each point, -1 for the building."""
@@ -184,10 +177,21 @@ class _Surface:
         # Points near a wall that are in no hanging patch belong to the wall, or to the back of an object in front of
         # it.
         free = ~shell & (~by_wall | (distinct & (patches < 0) & (np.abs(off) > _WALL_M)))
-        ok = self.linked & free[self.a] & free[self.b]
-        labels = np.where(free, components(self.count, self.a[ok], self.b[ok]), -1)
+        rows = np.flatnonzero(free)
+        beside, near = self._linked(rows, _LINKED)
+        labels = np.where(free, self._components(rows, beside, near & free[beside]), -1)
         labels = self._with_floating(labels)
         return np.where(hanging >= 0, hanging + self.count, labels)
+
+    def _linked(self, rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the (R, count) nearest neighbours of some points, and a mask of those near enough for one segment."""
+        beside = self.neighbours[rows, 1 : count + 1]
+        reach = _LINK * np.minimum(self.spacing[rows, None], self.spacing[beside])
+        return beside, self.distances[rows, 1 : count + 1] < np.clip(reach, _LINK_MIN_M, _LINK_MAX_M)
+
+    def _components(self, rows: np.ndarray, beside: np.ndarray, joined: np.ndarray) -> np.ndarray:
+        """Return the (N,) connected component of each point, where some neighbours (R, K) of the rows are joined."""
+        return components(self.count, rows[np.nonzero(joined)[0]], beside[joined])
 
     def _nearest_walls(self, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the (N,) wall near each point, -1 for none, and the signed distance of the point from it."""
@@ -204,40 +208,51 @@ class _Surface:
         foreign = np.zeros(self.count, bool)
         rows = np.flatnonzero(by_wall & (np.abs(off) < _WALL_M))
         # The colour of a single Gaussian is noisy: average over neighbours at the same distance from the wall.
-        beside = self.neighbours[rows]
-        level = (np.abs(off[beside] - off[rows, None]) < _LAYER_M)[..., None]
-        mean = np.zeros((self.count, 3))
-        mean[rows] = (level * self.lab[beside]).sum(1) / level.sum(1)
+        mean, number = np.zeros((len(rows), 3)), np.zeros(len(rows))
+        for beside in self.neighbours[rows].T:
+            level = np.abs(off[beside] - off[rows]) < _LAYER_M
+            mean += level[:, None] * self.lab[beside]
+            number += level
+        mean = (mean / number[:, None]).T
+        along = np.empty(len(rows))
         for i, plane in enumerate(self.structure.walls):
-            on = rows[wall[rows] == i]
-            along = self.points[on, :2] @ plane.along
-            band = np.floor(self.structure.heights_m[on] / _BAND_M)
-            for height in np.unique(band):
-                at = np.flatnonzero(band == height)
-                place = np.floor(along[at] / _BAND_M)
-                for step in np.unique(place):
-                    here = at[place == step]
-                    around = at[np.abs(along[at] - (step + 0.5) * _BAND_M) < _AROUND_M]
-                    expected = np.median(mean[on[around]], axis=0)
-                    foreign[on[here]] = np.linalg.norm(mean[on[here]] - expected, axis=1) > _WALL_LAB
+            on = np.flatnonzero(wall[rows] == i)
+            along[on] = self.points[rows[on], :2] @ plane.along
+        band = np.floor(self.structure.heights_m[rows] / _BAND_M)
+        order = np.lexsort((along, band, wall[rows]))
+        mean, along, band, place = mean[:, order], along[order], band[order], np.floor(along[order] / _BAND_M)
+        bands = _runs(wall[rows[order]], band)
+        expected = np.empty_like(mean)
+        for start, end in bands:
+            for first, last in _runs(place[start:end]) + start:
+                gap = along[start:end] - (place[first] + 0.5) * _BAND_M
+                low, high = start + np.searchsorted(gap, -_AROUND_M, "right"), start + np.searchsorted(gap, _AROUND_M)
+                half, odd = divmod(high - low, 2)
+                middle = np.partition(mean[:, low:high], (half - 1 + odd, half), axis=1)[:, [half - 1 + odd, half]]
+                expected[:, first:last] = middle.sum(1, keepdims=True) / 2
+        foreign[rows[order]] = np.sqrt(((mean - expected) ** 2).sum(0)) > _WALL_LAB
         return foreign
 
     def _hanging(self, free: np.ndarray, distinct: np.ndarray, wall: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return two (N,) labels of patches on walls, -1 for none: of the patches that hang and are kept, and of all
         that hang."""
         # Trims are thin, so find patches by their core points, then add the rim back to each core.
-        same = self.near & (wall[self.a] == wall[self.b]) & (wall[self.a] >= 0)
-        others = np.bincount(self.a[same], distinct[self.b[same]], minlength=self.count)
-        core = distinct & (others > _CORE * np.bincount(self.a[same], minlength=self.count))
-        ok = same & core[self.a] & core[self.b]
-        patch = np.where(core, components(self.count, self.a[ok], self.b[ok]), -1)
-        rim = same & (patch[self.a] >= 0) & distinct[self.b] & ~core[self.b]
-        patch[self.b[rim][::-1]] = patch[self.a[rim][::-1]]
+        rows = np.flatnonzero(wall >= 0)
+        beside, near = self._linked(rows, _NEIGHBOURS)
+        same = near & (wall[beside] == wall[rows, None])
+        others = np.count_nonzero(same & distinct[beside], axis=1)
+        core = np.zeros(self.count, bool)
+        core[rows] = distinct[rows] & (others > _CORE * np.count_nonzero(same, axis=1))
+        patch = np.where(core, self._components(rows, beside, same & core[rows, None] & core[beside]), -1)
+        rim = same & (patch[rows, None] >= 0) & (distinct & ~core)[beside]
+        patch[beside[rim][::-1]] = patch[rows[np.nonzero(rim)[0]][::-1]]
         # Look at the neighbours of the rims: those of a picture are on the wall, those of a bookshelf's back on the
         # bookshelf.
-        rim = (patch[self.a] >= 0) & (patch[self.a] != patch[self.b]) & (self.length < 1.25 * _LINK_MAX_M)
-        leaving = np.bincount(patch[self.a[rim]], minlength=self.count)
-        to_free = np.bincount(patch[self.a[rim]], free[self.b[rim]], minlength=self.count)
+        rows = np.flatnonzero(patch >= 0)
+        beside = self.neighbours[rows, 1:]
+        rim = (patch[beside] != patch[rows, None]) & (self.distances[rows, 1:] < 1.25 * _LINK_MAX_M)
+        leaving = np.bincount(patch[rows], np.count_nonzero(rim, axis=1), self.count)
+        to_free = np.bincount(patch[rows], np.count_nonzero(rim & free[beside], axis=1), self.count)
         mine = patch >= 0
         size = np.bincount(patch[mine], self.areas[mine], minlength=self.count)
         number = np.bincount(patch[mine], minlength=self.count)
@@ -251,23 +266,24 @@ class _Surface:
     def _with_floating(self, labels: np.ndarray) -> np.ndarray:
         """Assign unsupported segments to the segment below them, such as a shade to its lamp."""
         heights = self.structure.heights_m
-        used, compact = np.unique(labels[labels >= 0], return_inverse=True)
-        if not len(used):
-            return labels
         rows = np.flatnonzero(labels >= 0)
-        order = np.argsort(compact, kind="stable")
-        parts = np.split(rows[order], np.cumsum(np.bincount(compact))[:-1])
-        low = np.array([heights[p].min() for p in parts])
-        high = np.array([heights[p].max() for p in parts])
-        boxes = np.array([[self.points[p, :2].min(0), self.points[p, :2].max(0)] for p in parts])
+        if not len(rows):
+            return labels
+        used, compact = np.unique(labels[rows], return_inverse=True)
+        ordered = rows[np.argsort(compact, kind="stable")]
+        starts = np.searchsorted(labels[ordered], used)
+        low, high = (bound.reduceat(heights[ordered], starts) for bound in (np.minimum, np.maximum))
+        plan = self.points[ordered, :2]
+        boxes = np.stack([bound.reduceat(plan, starts) for bound in (np.minimum, np.maximum)], axis=1)
         middle = boxes.mean(1)
-        carrier = np.arange(len(parts))
+        carrier = np.arange(len(used))
         top = self.structure.ceiling_m
         for i in np.argsort(low, kind="stable"):
             if low[i] < 0.15 or high[i] > top - 2 * _CEILING_M - 0.05:
                 continue
-            below = (low < low[i] - 0.05) & (high > low[i] - 1.4) & (np.arange(len(parts)) != i)
-            below &= ((boxes[:, 0] - 0.03 < middle[i]) & (boxes[:, 1] + 0.03 > middle[i])).all(1)
+            below = (low < low[i] - 0.05) & (high > low[i] - 1.4) & (np.arange(len(used)) != i)
+            for axis in range(2):
+                below &= (boxes[:, 0, axis] - 0.03 < middle[i, axis]) & (boxes[:, 1, axis] + 0.03 > middle[i, axis])
             # The segment lies on the segment below, or within it.
             below &= (high < low[i] + 0.3) | (high >= high[i] - 0.05)
             if below.any():
@@ -277,6 +293,13 @@ class _Surface:
         out = labels.copy()
         out[rows] = used[carrier[compact]]
         return out
+
+
+def _runs(*keys: np.ndarray) -> np.ndarray:
+    """Return the (R, 2) starts and ends of the runs of rows with equal keys (N,)."""
+    changes = np.any([key[1:] != key[:-1] for key in keys], axis=0)
+    bounds = np.concatenate([[0], np.flatnonzero(changes) + 1, [len(keys[0])]])
+    return np.stack([bounds[:-1], bounds[1:]], axis=1)[: len(keys[0])]
 
 
 def _numbered(labels: np.ndarray) -> np.ndarray:

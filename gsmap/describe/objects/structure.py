@@ -86,30 +86,39 @@ def find_structure(
     """
     heights, ceiling, has_ceiling = _heights(points, np.abs(normals[:, 2]) > 0.95, areas)
     upright = (np.abs(normals[:, 2]) < 0.2) & (planarity > 0.3) & (heights > _FLAT_M) & (heights < ceiling + _REACH_M)
-    a = np.repeat(np.arange(len(points)), neighbours.shape[1] - 1)
-    b = neighbours[:, 1:].ravel()
-    both = upright[a] & upright[b]
-    a, b = a[both], b[both]
-    step = points[a] - points[b]
-    flat = np.abs((normals[a] * normals[b]).sum(1)) > _PARALLEL
-    flat &= (np.abs((step * normals[a]).sum(1)) < _FLAT_M) & (np.abs((step * normals[b]).sum(1)) < _FLAT_M)
-    patch = components(len(points), a[flat], b[flat])
-    size = np.bincount(patch, areas * upright)
-    by_patch = np.argsort(patch, kind="stable")
-    ends = np.cumsum(np.bincount(patch))
+    rows, row_of = np.flatnonzero(upright), np.cumsum(upright) - 1
+    at, facing = np.ascontiguousarray(points.T), np.ascontiguousarray(normals.T)  # sums along rows of three are slow
+    links = []
+    for b in np.ascontiguousarray(neighbours[rows, 1:].T):
+        both = np.flatnonzero(upright[b])
+        a, b = rows[both], b[both]
+        step, one, other = at.take(a, 1) - at.take(b, 1), facing.take(a, 1), facing.take(b, 1)
+        flat = (np.abs(_dot(one, other)) > _PARALLEL) & (np.abs(_dot(step, one)) < _FLAT_M)
+        flat &= np.abs(_dot(step, other)) < _FLAT_M
+        links.append(np.stack([both[flat], row_of[b[flat]]]))
+    patch = components(len(rows), *np.concatenate(links, axis=1))
+    size = np.bincount(patch, areas[rows])
+    counts = np.bincount(patch)
+    by_patch, ends = rows[np.argsort(patch, kind="stable")], np.cumsum(counts)
+    plan, sideways = np.ascontiguousarray(points[:, :2]), np.ascontiguousarray(normals[:, :2])
     walls: list[Wall] = []
     for label in np.argsort(-size, kind="stable"):
         if size[label] < _PATCH_M2:
             break
-        rows = by_patch[ends[label] - np.count_nonzero(patch == label) : ends[label]]
-        rows = rows[upright[rows]]
+        rows = by_patch[ends[label] - counts[label] : ends[label]]
         if np.quantile(heights[rows], 0.98) < ceiling - _REACH_M:
             continue
         if not any(_is_of(wall, points[rows]) for wall in walls):
-            wall = _wall(points, normals, areas, rows)
+            wall = _wall(plan, sideways, areas, rows)
             if wall is not None:
                 walls.append(wall)
     return Structure(heights, ceiling, has_ceiling, tuple(walls))
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the (N,) dot products of the columns of two (3, N) arrays."""
+    out: np.ndarray = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return out
 
 
 def _heights(points: np.ndarray, flat: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, float, bool]:
@@ -140,37 +149,43 @@ def _is_of(wall: Wall, points: np.ndarray) -> bool:
     return bool((off & wall.inside(points)).mean() > 0.8)
 
 
-def _wall(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, rows: np.ndarray) -> Wall | None:
-    """Fit a plane to all points of a patch, and its extent; return None if the patch is a pillar."""
-    patch = points[rows, :2]
+def _wall(plan: np.ndarray, sideways: np.ndarray, areas: np.ndarray, rows: np.ndarray) -> Wall | None:
+    """Fit a plane to all points of a patch, and its extent; return None if the patch is a pillar.
+
+    Args:
+        plan, sideways: (N, 2) horizontal coordinates of all points and of their normals.
+        areas: (N,) areas.
+        rows: the patch.
+    """
+    patch = plan[rows]
     middle = patch.mean(0)
     normal = np.linalg.eigh((patch - middle).T @ (patch - middle))[1][:, 0]
     offset, span = middle @ normal, np.zeros(2)
     for _ in range(3):
         along = np.array([-normal[1], normal[0]])
         span = np.quantile(patch @ along, [0.02, 0.98])
-        at = points[:, :2] @ along
-        near = np.abs(points[:, :2] @ normal - offset) < 1.5 * _FLAT_M
-        on = near & (np.abs(normals[:, :2] @ normal) > 0.9) & (at > span[0] - 0.2) & (at < span[1] + 0.2)
-        if np.count_nonzero(on) < 10:
+        near = np.flatnonzero(np.abs(plan @ normal - offset) < 1.5 * _FLAT_M)
+        at = plan[near] @ along
+        on = near[(np.abs(sideways[near] @ normal) > 0.9) & (at > span[0] - 0.2) & (at < span[1] + 0.2)]
+        if len(on) < 10:
             break
         weight = areas[on]
-        middle = np.average(points[on, :2], axis=0, weights=weight)
-        centred = points[on, :2] - middle
+        middle = np.average(plan[on], axis=0, weights=weight)
+        centred = plan[on] - middle
         fitted = np.linalg.eigh((centred * weight[:, None]).T @ centred)[1][:, 0]
         normal = fitted * (np.sign(fitted @ normal) or 1.0)
         offset = middle @ normal
     if np.ptp(span) < 0.5:
         return None
     along = np.array([-normal[1], normal[0]])
-    facing = np.abs(normals[:, :2] @ normal) > 0.8
-    off = points[:, :2] @ normal - offset
-    on = facing & (np.abs(off) < 2 * _FLAT_M)
+    off = plan @ normal - offset
+    on = np.flatnonzero(np.abs(off) < 2 * _FLAT_M)
+    on = on[np.abs(sideways[on] @ normal) > 0.8]
     # The mode of the distances is the wall without the objects on it.
     bins, edges = np.histogram(off[on], bins=40, range=(-2 * _FLAT_M, 2 * _FLAT_M), weights=areas[on])
     peak = int(np.argmax(np.convolve(bins, np.ones(5), "same")))
     offset += 0.5 * (edges[peak] + edges[peak + 1])
-    steps = np.floor(points[on, :2] @ along / _STEP_M).astype(int)
+    steps = np.floor(plan[on] @ along / _STEP_M).astype(int)
     low = steps.min()
     there = np.flatnonzero(np.bincount(steps - low, areas[on]) > 0.02) + low
     first, last = np.floor(span / _STEP_M).astype(int)
