@@ -1,5 +1,5 @@
 """Scene graphs of captures."""
 
-from gsmap.describe.graph import Params, describe, recipe_key
+from gsmap.describe.graph import GraphBasis, Params, describe, find_basis, recipe_key
 
-__all__ = ["Params", "describe", "recipe_key"]
+__all__ = ["GraphBasis", "Params", "describe", "find_basis", "recipe_key"]

@@ -84,6 +84,49 @@ def recipe_key(params: Params | None = None, models: Mapping[str, ModelSpec] | N
     return RecipeKey("describe", "graph", version, settings, backend)
 
 
+@dataclass(frozen=True, eq=False)
+class GraphBasis:
+    """Surface, vertical and units of a capture, which all layers of its scene graph share.
+
+    Args:
+        cloud: the surface.
+        up: (3,) direction against gravity in the scene's frame; None if unknown.
+        guess_m: metres per scene unit, from `estimate_unit_m`.
+        unit_m, working_m: see `SceneGraph`.
+        units: from `landmark_units`.
+        registration_m: unit of the scene when it is prepared for registration (`gsmap.register.prepare.working_m_of`).
+    """
+
+    cloud: PointCloud
+    up: np.ndarray | None
+    guess_m: float
+    unit_m: float
+    working_m: float
+    units: Mapping[str, float]
+    registration_m: float
+
+
+def find_basis(
+    gaussians: Gaussians, cameras: Cameras | None, params: Params | None = None, *, scale_policy: str = "auto"
+) -> GraphBasis:
+    """Find the surface, vertical and units of one capture; see `describe`."""
+    params = params or Params()
+    if scale_policy not in SCALE_POLICIES:
+        raise ConfigError(
+            f"scale policy must be one of {', '.join(SCALE_POLICIES)}, got {scale_policy!r}", code="invalid_choice"
+        )
+    cloud = surface_cloud(gaussians.degree_0(), params.min_opacity)
+    up = estimate_up(cloud.points, cameras)
+    guess_m = estimate_unit_m(cloud.points, cameras, up, params.view_distance_m)
+    working_m = working_unit_m(guess_m, cameras)
+    units = landmark_units(guess_m, scale_policy, working_m=working_m)
+    if "landmarks" not in units:  # the unit is not the metre
+        working_m = guess_m
+    unit_m = 1.0 if scale_policy == "known" else guess_m
+    registration_m = working_m if scale_policy == "known" or params.landmarks else unit_m
+    return GraphBasis(cloud, up, guess_m, unit_m, working_m, units, registration_m)
+
+
 def describe(
     scene_id: str,
     gaussians: Gaussians,
@@ -92,6 +135,7 @@ def describe(
     models: Mapping[str, ModelSpec] | None = None,
     *,
     scale_policy: str = "auto",
+    basis: GraphBasis | None = None,
     progress: Progress = silent,
 ) -> SceneGraph:
     """Describe one capture: find its surface, vertical and unit, then compute each layer of its scene graph.
@@ -103,6 +147,7 @@ def describe(
         models: checked ONNX models by kind, for the methods that need them (`gsmap.describe.onnx.check`).
         scale_policy: ``known`` (the unit is the metre: no layers at estimated units), ``unknown`` (only layers at
             estimated units), or ``auto`` (both, where a metre is plausible).
+        basis: from `find_basis` with the same arguments, if it was called before.
 
     Returns:
         The scene graph, with layers, vertical and extents in the scene's frame and unit; ``notes`` are for the user.
@@ -113,19 +158,9 @@ def describe(
     from gsmap.geometry.threads import run_aside  # imported here, as the recipe key does not need it
 
     params, gaussians = params or Params(), gaussians.degree_0()
-    if scale_policy not in SCALE_POLICIES:
-        raise ConfigError(
-            f"scale policy must be one of {', '.join(SCALE_POLICIES)}, got {scale_policy!r}", code="invalid_choice"
-        )
     progress(0.0, "surface")
-    cloud = surface_cloud(gaussians, params.min_opacity)
-    up = estimate_up(cloud.points, cameras)
-    guess_m = estimate_unit_m(cloud.points, cameras, up, params.view_distance_m)
-    working_m = working_unit_m(guess_m, cameras)
-    units = landmark_units(guess_m, scale_policy, working_m=working_m)
-    if "landmarks" not in units:  # the unit is not the metre
-        working_m = guess_m
-    unit_m = 1.0 if scale_policy == "known" else guess_m
+    basis = basis or find_basis(gaussians, cameras, params, scale_policy=scale_policy)
+    cloud, up, units = basis.cloud, basis.up, basis.units
     layers: dict[str, NodeLayer] = {}
     notes: list[str] = []
     if len(cloud) == 0:
@@ -134,12 +169,12 @@ def describe(
         notes.append(
             "the vertical is unknown (no cameras that turn about it, no clear floor): landmarks are matched without it"
         )
-    segments_unit_m = 1.0 if "landmarks" in units else unit_m
+    segments_unit_m = 1.0 if "landmarks" in units else basis.unit_m
     with run_aside(lambda: find_segments(gaussians, cloud, up, segments_unit_m) if params.things else None) as segments:
         if params.landmarks:
             layers |= _landmark_layers(cloud, up, units, params.landmark, progress)
         if params.objects:
-            seen_m = working_m if scale_policy == "known" else guess_m
+            seen_m = basis.working_m if scale_policy == "known" else basis.guess_m
             context = SceneContext(cloud, len(gaussians), up, seen_m, models or {})
             layers["objects"], remarks = object_layer(
                 gaussians, cameras, context, params.object, lambda fraction, text: progress(0.6 + 0.35 * fraction, text)
@@ -150,7 +185,7 @@ def describe(
     if len(cloud) and not any(len(layer) >= _FEW_NODES for layer in layers.values()):
         notes.append(f"fewer than {_FEW_NODES} nodes in every layer: too little colour or shape for registration")
     progress(1.0, "described")
-    graph = SceneGraph(scene_id, layers, up, unit_m, tuple(notes), found, working_m)
+    graph = SceneGraph(scene_id, layers, up, basis.unit_m, tuple(notes), found, basis.working_m)
     return round_graph(graph)
 
 

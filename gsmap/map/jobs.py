@@ -103,24 +103,27 @@ def describe_scene(
 ) -> tuple[SceneGraph, PreparedScene]:
     """Build the scene graph of one scene of the map at ``path`` (`Store.location`), and prepare its registration."""
     from gsmap import describe as describing
+    from gsmap.geometry.threads import run_aside
     from gsmap.register.prepare import prepare
 
     scenes = _store(path).scenes
     policy = scenes.get(scene_id).scale_policy
     gaussians, cameras = scenes.unread(scene_id).degree_0(), scenes.cameras(scene_id)
-    graph = describing.describe(scene_id, gaussians, cameras, params, models, scale_policy=policy)
-    return graph, prepare(scene_id, gaussians, cameras, graph, policy)
+    basis = describing.find_basis(gaussians, cameras, params, scale_policy=policy)
+    with run_aside(lambda: prepare(scene_id, gaussians, cameras, basis.registration_m)) as prepared:
+        graph = describing.describe(scene_id, gaussians, cameras, params, models, scale_policy=policy, basis=basis)
+        return graph, prepared()
 
 
 def prepare_scene(path: str, scene_id: str, graph_key: str) -> PreparedScene:
     """Prepare a scene of the map at ``path`` that was described by an older release."""
-    from gsmap.register.prepare import prepare
+    from gsmap.register.prepare import prepare, working_m_of
 
     store = _store(path)
     graph, scenes = store.graphs.load(scene_id, graph_key), store.scenes
     assert graph is not None, f"scene {scene_id} was to be prepared before it was described"
     gaussians, cameras = scenes.unread(scene_id).degree_0(), scenes.cameras(scene_id)
-    return prepare(scene_id, gaussians, cameras, graph, scenes.get(scene_id).scale_policy)
+    return prepare(scene_id, gaussians, cameras, working_m_of(graph, scenes.get(scene_id).scale_policy))
 
 
 def features_of_scene(

@@ -21,18 +21,19 @@ MAX_OWN_VIEWS = 64  # of a scene's own cameras, evenly along the capture
 _NO_CAMERAS = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 4)), np.zeros((0, 2), np.int64))
 
 
-def prepare(
-    scene: str, gaussians: Gaussians, cameras: Cameras | None, graph: SceneGraph, scale_policy: str
-) -> PreparedScene:
+def working_m_of(graph: SceneGraph, scale_policy: str) -> float:
+    """Return the working metres per scene unit in which a scene is prepared."""
+    return graph.working_m if scale_policy == "known" or "landmarks" in graph.layers else graph.unit_m
+
+
+def prepare(scene: str, gaussians: Gaussians, cameras: Cameras | None, unit_m: float) -> PreparedScene:
     """Compute the surface cells of a scene in its own working metres, and render its views.
 
     Args:
         scene: id of the scene.
         gaussians, cameras: in the scene's frame and unit; without cameras there are no views.
-        graph: the scene graph, from which the unit is taken.
-        scale_policy: of the scene, as in `SceneView`.
+        unit_m: from `working_m_of`.
     """
-    unit_m = graph.working_m if scale_policy == "known" or "landmarks" in graph.layers else graph.unit_m
     is_surface = np.zeros(len(gaussians), bool)
     is_surface[surface_rows(gaussians, unit_m)] = True
     points, colours = Surface.from_splats(gaussians.degree_0(is_surface), unit_m).coarse

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from gsmap.errors import ConfigError
-from gsmap.register.prepare import prepare
+from gsmap.register.prepare import prepare, working_m_of
 from gsmap.register.surface import Surface
 from gsmap.register.view_cache import PreparedViews, ViewCache
 from gsmap.types import Cameras, Gaussians, SceneGraph
@@ -49,7 +49,8 @@ class SceneView:
         """Preparation that all pairs of the scene share; computed unless it is known."""
         if self.known is not None:
             return self.known
-        return prepare(self.id, self.gaussians.degree_0(), self.cameras, self.graph, self.scale_policy)
+        unit_m = working_m_of(self.graph, self.scale_policy)
+        return prepare(self.id, self.gaussians.degree_0(), self.cameras, unit_m)
 
     @property
     def centre(self) -> np.ndarray:

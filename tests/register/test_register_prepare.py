@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gsmap.describe import Params, describe, find_basis
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.register import SceneView
-from gsmap.register.prepare import MAX_OWN_VIEWS, prepare
+from gsmap.register.prepare import MAX_OWN_VIEWS, prepare, working_m_of
 from gsmap.register.surface import Surface
 from gsmap.register.view_cache import PreparedViews, ViewCache
 from gsmap.types import Cameras, Gaussians, SceneGraph, Sim3
@@ -35,7 +36,7 @@ def _cameras(count: int) -> Cameras:
 
 @pytest.fixture(scope="module")
 def prepared():
-    return prepare("room", _room(), _cameras(6), SceneGraph("room"), "known")
+    return prepare("room", _room(), _cameras(6), 1.0)
 
 
 def test_views_are_renders_within_a_grey_level_and_a_half_float(prepared):
@@ -63,7 +64,7 @@ def test_cells_are_those_of_the_surface_and_face_the_cameras(prepared):
 def test_depths_are_in_working_metres_and_images_in_the_unit_of_the_scene():
     S = Sim3(np.eye(3), np.zeros(3), 10.0)
     room, cameras = transform_gaussians(_room(), S), transform_cameras(_cameras(3), S)
-    found = prepare("room", room, cameras, SceneGraph("room", working_m=0.1), "known")
+    found = prepare("room", room, cameras, 0.1)
     first = found.image_depths[: found.cameras.sizes_px[0].prod()].astype(float)
     assert 1.3 < np.median(first[np.isfinite(first)]) < 1.7
     depth = PreparedViews(found).image(0).depth
@@ -71,14 +72,24 @@ def test_depths_are_in_working_metres_and_images_in_the_unit_of_the_scene():
     assert np.ptp(found.points, axis=0).max() < 4.1
 
 
+@pytest.mark.parametrize("policy", ["known", "auto", "unknown"])
+@pytest.mark.parametrize("landmarks", [True, False])
+def test_unit_is_known_before_the_graph(policy, landmarks):
+    room, cameras = _room(), _cameras(3)
+    params = Params(landmarks=landmarks, objects=False, things=False)
+    basis = find_basis(room, cameras, params, scale_policy=policy)
+    graph = describe("room", room, cameras, params, scale_policy=policy)
+    assert basis.registration_m == working_m_of(graph, policy)
+
+
 def test_many_cameras_give_a_bounded_number_of_views():
-    found = prepare("room", _room(500), _cameras(MAX_OWN_VIEWS + 30), SceneGraph("room"), "known")
+    found = prepare("room", _room(500), _cameras(MAX_OWN_VIEWS + 30), 1.0)
     assert found.num_own == MAX_OWN_VIEWS
 
 
 def test_without_cameras_or_gaussians_there_are_no_views():
-    assert len(prepare("room", _room(500), None, SceneGraph("room"), "known").cameras) == 0
-    nothing = prepare("room", Gaussians.empty(), _cameras(2), SceneGraph("room"), "known")
+    assert len(prepare("room", _room(500), None, 1.0).cameras) == 0
+    nothing = prepare("room", Gaussians.empty(), _cameras(2), 1.0)
     assert not len(nothing.points)
     assert not len(nothing.image_depths)
 
