@@ -22,7 +22,7 @@ from gsmap.render.fit import make_fitter, with_enough_memory
 from gsmap.render.fitter import FitOptions, LearningRates
 from gsmap.types import Cameras, Gaussians
 
-VERSION = 4
+VERSION = 5
 """Raised whenever the same tiles and cameras give other levels; all levels are then made again."""
 
 _SCREEN_PX = 16.0  # default screen-space error of viewers of 3D Tiles, above which they refine

@@ -22,7 +22,7 @@ def map_ahead(
     """Yield the results of a function, in the order of the items, while threads compute those of the next items.
 
     Args:
-        items: taken by the calling thread, at most two for each thread before their results.
+        items: taken by the calling thread, at most two for each thread, and one, before their results.
         threads: 1 runs the function in the calling thread; None takes as many as native kernels
             have, at most `_MOST`.
     """

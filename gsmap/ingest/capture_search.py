@@ -172,11 +172,13 @@ def _product(folder: Path) -> str | None:
 
 
 def exported_scenes(path: Path) -> set[str]:
-    """Return the ids of the scenes from which gsmap exported a file; empty for other files."""
-    for folder in path.resolve().parents[:2]:
+    """Return the ids of the scenes from which gsmap exported a file, by the export's ``tiles.json``; empty for other
+    files."""
+    path = path.resolve()
+    for folder in path.parents[:2]:
         try:
             tiles = json.loads((folder / "tiles.json").read_bytes())["tiles"]
-            return {str(scene) for tile in tiles for scene in tile["S_map_scene"]}
+            return {str(s) for tile in tiles if folder / tile["path"] == path for s in tile["S_map_scene"]}
         except (OSError, *MALFORMED):
             continue
     return set()

@@ -64,16 +64,6 @@ class References:
 
 
 @dataclass(frozen=True, eq=False)
-class _Visibility:
-    """Visibility of a scene's (N,) Gaussians in a view: the pixels that each dominates, those of them that no change
-    disputes, and the largest weights."""
-
-    pixels: np.ndarray
-    sure: np.ndarray
-    largest: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class _View:
     """A rendered reference view; see `References`. ``points`` are those of `_coarse_points`."""
 
@@ -140,30 +130,31 @@ def render_references(
         for index, piece, scene in zip(indices, pieces, scenes, strict=True)
     ]
     comparison, compared = SharpnessComparison(pieces, indices), compared_views([i for i, _, _ in todo])
-    one_at_a_time = threading.Lock()  # what scenes keep of their views and changes is not made for threads
+    lock = threading.Lock()  # what scenes keep of their views and changes is not made for threads
 
-    def look(one: tuple[int, tuple[int, int, Cameras]]) -> tuple[int, _Visibility | None, _View | None]:
+    def make_view(one: tuple[int, tuple[int, int, Cameras]]) -> tuple[int, _View | None]:
         done, (i, c, camera) = one
-        disputed = counted = None
+        disputed = None
         if (shared := reference_views[i]) is not None:
-            with one_at_a_time:
+            with lock:
                 sight = shared.of(c)
                 shared.count(sight, pixels[i], largest[i])
                 if not shared.touches(sight, bounds, halo_m / 2):
-                    return i, None, None
+                    return i, None
                 depth = shared.depth(sight)
         else:
             seen = render(scenes[i].gaussians, camera, max_weight=True, index=whole_indices[i])
             if settled is not None and settled.is_disputed(i):
-                with one_at_a_time:
+                with lock:
                     disputed = settled.outdated_pixels(i, camera)
-            counted = _count(seen, disputed)
+            with lock:
+                _count(seen, disputed, pixels[i], sure[i], largest[i])
             depth = seen.depth[0]
         counts = inside_pixels(camera, depth, bounds, halo_m / 2)
         if disputed is not None:
             counts &= ~disputed
         if counts.mean() < _MIN_TILE_FRACTION:  # a weight is at most 1
-            return i, counted, None
+            return i, None
         window = _window(counts)
         if shared is None and pieces[i] is scenes[i].gaussians:
             colour, alpha = seen.colour[0][window], seen.alpha[0][window]
@@ -173,18 +164,14 @@ def render_references(
         weight = alpha * counts[window]
         share = float(weight.sum() / counts.size)
         if share < _MIN_TILE_FRACTION:
-            return i, counted, None
+            return i, None
         camera, depth, colour = _cropped(camera, window), depth[window], np.clip(colour, 0, 1)
         parts = comparison.compare(i, camera, colour, depth, weight > _MIN_COMPARED_WEIGHT) if done in compared else {}
         image, weight = np.round(colour * 255).astype(np.uint8), np.round(np.clip(weight, 0, 1) * 255).astype(np.uint8)
-        return i, counted, _View(camera, image, weight, share, _coarse_points(camera, depth), parts)
+        return i, _View(camera, image, weight, share, _coarse_points(camera, depth), parts)
 
-    for done, (i, counted, view) in enumerate(map_ahead(look, enumerate(todo))):
+    for done, (i, view) in enumerate(map_ahead(make_view, enumerate(todo))):
         progress(done / len(todo), "rendering reference views")
-        if counted is not None:
-            pixels[i] += counted.pixels
-            sure[i] += counted.sure
-            np.maximum(largest[i], counted.largest, out=largest[i])
         if view is None:
             continue
         cameras.append(view.camera)
@@ -281,12 +268,17 @@ def _best_views(
     return [todo[row] for row in sorted(chosen)]
 
 
-def _count(seen: Rendering, disputed: np.ndarray | None) -> _Visibility:
+def _count(
+    seen: Rendering, disputed: np.ndarray | None, pixels: np.ndarray, sure: np.ndarray, largest: np.ndarray
+) -> None:
+    """Add the pixels that each Gaussian dominates to ``pixels``, undisputed ones to ``sure``; update ``largest``."""
     dominant = seen.dominant_id[0]
-    pixels = sure = np.bincount(dominant[dominant >= 0], minlength=len(seen.max_weight))
+    shown = np.bincount(dominant[dominant >= 0], minlength=len(pixels))
+    pixels += shown
     if disputed is not None:
-        sure = np.bincount(dominant[(dominant >= 0) & ~disputed], minlength=len(pixels))
-    return _Visibility(pixels, sure, seen.max_weight)
+        shown = np.bincount(dominant[(dominant >= 0) & ~disputed], minlength=len(pixels))
+    sure += shown
+    np.maximum(largest, seen.max_weight, out=largest)
 
 
 def _coarse_points(camera: Cameras, depth: np.ndarray) -> np.ndarray:

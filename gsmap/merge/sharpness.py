@@ -86,7 +86,7 @@ class SharpnessComparison:
         return found
 
     def add(self, compared: Compared) -> None:
-        """Add what a view shows."""
+        """Add the result of `compare` for one view."""
         for pair, sums in compared.items():
             self._sums.setdefault(pair, []).append(sums)
 

@@ -12,8 +12,8 @@ from gsmap.types.views import Mask, SceneContext, View
 
 
 class Embedder(Protocol):
-    """An embedder for one scene; the cosine of two embeddings measures similarity. If neither it nor the segmenter has
-    models, it is called from several threads, for different views.
+    """An embedder for one scene; the cosine of two embeddings measures similarity. It is called from
+    several threads, for different views, if it and the segmenter say ``is_thread_safe = True``.
 
     They depend on the method, its parameters and its model alone beside what is seen, so that those of all scenes
     compare.

@@ -9,7 +9,7 @@ from gsmap.types.views import Mask, SceneContext, View
 
 
 class Segmenter(Protocol):
-    """A segmenter for one scene. If neither it nor the embedder has models, it is called from several threads."""
+    """A segmenter for one scene; called from several threads if it and the embedder say ``is_thread_safe = True``."""
 
     def segment(self, view: View) -> list[Mask]:
         """Return the masks of a view, in any order; masks may overlap.

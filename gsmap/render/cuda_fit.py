@@ -1,4 +1,4 @@
-"""The fitter on the GPU: all of a step are kernels of fitter.cu, between them torch sorts.
+"""The fitter on the GPU: kernels of fitter.cu do everything in a step but the sorting, which torch does.
 
 A step on one view is replayed as two CUDA graphs: the first projects the Gaussians and counts the entries of the lists
 of tiles; the second sorts these, blends, differentiates and updates. What differs between views lies in memory that the
@@ -12,7 +12,6 @@ import contextlib
 import functools
 import logging
 import math
-import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -44,6 +43,7 @@ _OPTIONS = np.dtype([("floats", "f4", 14), ("ints", "i4", 4)])
 
 _MOST_GRAPHS = 64
 _FEWEST_ENTRIES, _FEWEST_TILES = 1 << 14, 64
+_WIDE = 1 << 15  # number of tiles from which their numbers have 32 bits
 
 
 class CudaFitter(Fitter):
@@ -60,11 +60,10 @@ class CudaFitter(Fitter):
         super().__init__(gaussians, learning_rates, options=options)
         self._device = gsplat.device()
         held = checked_mask(frozen, len(gaussians))
-        self._views: weakref.WeakKeyDictionary[Cameras, np.ndarray] = weakref.WeakKeyDictionary()
-        self._entries_before: weakref.WeakKeyDictionary[Cameras, int] = weakref.WeakKeyDictionary()
+        self._entries_before: dict[bytes, int] = {}  # by camera, as the kernels read it
         self._corrections = _corrections(self.options.betas).to(self._device)
-        self._options = torch.empty(_OPTIONS.itemsize, dtype=torch.uint8, device=self._device)
-        self._options_sent = self._on_host(self._options)
+        self._options_there = torch.empty(_OPTIONS.itemsize, dtype=torch.uint8, device=self._device)
+        self._options_on_host = self._on_host(self._options_there)
         self._sent: object = None
         values = self._moved(gaussians)
         self._set(
@@ -97,7 +96,7 @@ class CudaFitter(Fitter):
         self._sums = torch.zeros(5, device=self._device)  # see fitter.cu
         self._num_entries = self._on_host(self._upto[-1:])
         self._counted = torch.cuda.Event() if self._device.type == "cuda" else None
-        self._unsettled: tuple[Cameras, int, int, _Loss] | None = None
+        self._unsettled: tuple[bytes, int, int, torch.Tensor] | None = None
         self._gradient_norm, self._max_weight = torch.zeros((2, n), device=self._device)
         self._seen = torch.zeros(n, dtype=torch.int32, device=self._device)
         self._reserve(1)
@@ -130,50 +129,54 @@ class CudaFitter(Fitter):
             return array  # the array is then sent to the GPU at every step
 
     def step(self, cameras: Cameras, images: Any, masks: Any = None) -> _Loss | float:
+        self._settle()
         width, height = image_size(cameras)
         count = len(cameras)
         targets = self._pixels(images, (count, height, width, 3), "images")
         weights = None if masks is None else self._pixels(masks, (count, height, width), "masks")
         if count == 0:
             return 0.0
-        self._settle()
         if count > len(self._steps):
             self._reserve(count)
         self._send_options(count)
-        self._send_steps(cameras, targets, weights)
+        camera = self._send_steps(cameras, targets, weights)
         num_tiles = _rounded(-(-width // _TILE) * -(-height // _TILE), _FEWEST_TILES)
-        if count == 1:
-            return self._step_one(cameras, num_tiles)
-        for v in range(count):
-            self._project(v)
-            self._count_entries()
-            self._blend(v, num_tiles, _room(self._counted_entries()))
-        self._update()
+        try:
+            if count == 1:
+                return self._step_one(camera, num_tiles)
+            for v in range(count):
+                self._project(v)
+                self._count_entries()
+                self._blend(v, num_tiles, _room(self._counted_entries()))
+            self._update()
+        except BaseException:
+            self._pixel_moments.zero_()
+            raise
         return _Loss(self, self._sums[_LOSS].clone())
 
-    def _step_one(self, cameras: Cameras, num_tiles: int) -> _Loss:
+    def _step_one(self, camera: bytes, num_tiles: int) -> _Loss:
         """Take a step on one view, with room for as many entries as it had before and a few more, so that the CPU need
         not wait for their number; if they do not fit, the step is taken again in `_settle`."""
         self._recorder("project", functools.partial(self._project, 0))
         self._count_entries()
-        before = self._entries_before.get(cameras)
+        before = self._entries_before.get(camera)
         room = _room(self._counted_entries() if before is None else before * 17 // 16)
         self._recorder((num_tiles, room), functools.partial(self._finish, num_tiles, room))
-        loss = _Loss(self, self._sums[_LOSS].clone())
-        self._unsettled = cameras, num_tiles, room, loss
-        return loss
+        loss = self._sums[_LOSS].clone()
+        self._unsettled = camera, num_tiles, room, loss
+        return _Loss(self, loss)
 
     def _settle(self) -> None:
         """Take the last step again if there was too little room for its entries."""
         if self._unsettled is None:
             return
-        cameras, num_tiles, room, loss = self._unsettled
+        camera, num_tiles, room, loss = self._unsettled
         self._unsettled = None
-        entries = self._entries_before[cameras] = self._counted_entries()
+        entries = self._entries_before[camera] = self._counted_entries()
         if entries > room:
             room = _room(entries)
             self._recorder((num_tiles, room), functools.partial(self._finish, num_tiles, room))
-            loss.value.copy_(self._sums[_LOSS])
+            loss.copy_(self._sums[_LOSS])
 
     def _count_entries(self) -> None:
         if len(self):
@@ -198,7 +201,7 @@ class CudaFitter(Fitter):
         """Project the Gaussians and sort them by depth."""
         n = len(self)
         if not n:
-            self._sums.zero_()
+            self._sums[: _LOSS + int(v == 0)] = 0
             return
         given = (self._steps[v], *self._values, self._frozen, n, self._k, int(v == 0))
         found = (self._records, self._depths, self._counts, self._sums)
@@ -209,14 +212,14 @@ class CudaFitter(Fitter):
     def _blend(self, v: int, num_tiles: int, entries: int) -> None:
         """Render a view and differentiate its loss by what was projected."""
         n, where = len(self), self._device
-        step, options, sums, narrow = self._steps[v], self._options, self._sums, int(num_tiles < 1 << 15)
+        step, options, sums, narrow = self._steps[v], self._options_there, self._sums, int(num_tiles < _WIDE)
         tiles = torch.empty(entries, dtype=torch.int16 if narrow else torch.int32, device=where)
         listed = torch.empty(entries, dtype=torch.int32, device=where)
         if n:
             by_depth = (self._records, self._order, self._upto, self._counts)
             self._launch("list_tiles", -(-n // 128), 128, step, *by_depth, n, entries, narrow, tiles, listed, sums)
         else:
-            tiles.fill_((1 << 15) - 1)
+            tiles.fill_(torch.iinfo(tiles.dtype).max)
         tiles, by_tile = torch.sort(tiles, stable=True)
         first = torch.arange(num_tiles + 1, device=where, dtype=tiles.dtype)
         lists = listed[by_tile], torch.searchsorted(tiles, first, out_int32=True)
@@ -241,7 +244,7 @@ class CudaFitter(Fitter):
         n = len(self)
         if not n:
             return
-        given = (self._steps, self._options, self._corrections, n, self._k, self._pixel_moments, self._updates)
+        given = (self._steps, self._options_there, self._corrections, n, self._k, self._pixel_moments, self._updates)
         counted = (self._gradient_norm, self._seen, self._sums)
         changed = (*self._values, *self._moments[0], *self._moments[1])
         self._launch("update", -(-n // 64), 64, *given, *changed, *counted, shared=64 * (6 * self._k + 15) * 4)
@@ -261,36 +264,32 @@ class CudaFitter(Fitter):
             *rates,
         )
         packed = np.array([(floats, (views, options.statistics, len(self._corrections) - 1, 0))], _OPTIONS)
-        self._options_sent.copy_(torch.from_numpy(packed.view(np.uint8)))
-        self._options.copy_(self._options_sent, non_blocking=True)
+        self._options_on_host.copy_(torch.from_numpy(packed.view(np.uint8)))
+        self._options_there.copy_(self._options_on_host, non_blocking=True)
         self._sent = wanted
 
-    def _send_steps(self, cameras: Cameras, targets: torch.Tensor, weights: torch.Tensor | None) -> None:
+    def _send_steps(self, cameras: Cameras, targets: torch.Tensor, weights: torch.Tensor | None) -> bytes:
+        """Send cameras, and where their pictures lie, to the GPU; return the bytes that the cameras are."""
         count = len(cameras)
         self._held = targets, weights  # until the GPU has read them
         steps = self._steps_sent[:count].numpy().view(_STEP)[:, 0]
-        steps[:] = self._seen_from(cameras)
+        width, height = image_size(cameras)
+        pose = cameras.T_camera_frame
+        steps[:] = np.zeros((), _STEP)
+        steps["pose"] = np.concatenate([pose[:, :3, :3].reshape(-1, 9), pose[:, :3, 3]], 1)
+        steps["intrinsics"] = cameras.intrinsics_px
+        steps["sizes"][:, :4] = width, height, -(-width // _TILE), -(-height // _TILE)
+        camera = steps.tobytes()
         steps["pixels"][:, 0] = targets.data_ptr() + np.arange(count) * targets[0].nbytes
         steps["sizes"][:, 4] = targets.dtype == torch.uint8
         if weights is not None:
             steps["pixels"][:, 1] = weights.data_ptr() + np.arange(count) * weights[0].nbytes
             steps["sizes"][:, 5] = weights.dtype == torch.uint8
         self._steps[:count].copy_(self._steps_sent[:count], non_blocking=True)
+        return camera
 
     def _on_host(self, like: torch.Tensor) -> torch.Tensor:
         return torch.empty(like.shape, dtype=like.dtype, pin_memory=self._device.type == "cuda")
-
-    def _seen_from(self, cameras: Cameras) -> np.ndarray:
-        """Return the cameras as the kernels read them; they are cached, because a schedule uses them many times."""
-        if cameras not in self._views:
-            width, height = image_size(cameras)
-            steps = np.zeros(len(cameras), _STEP)
-            pose = np.asarray(cameras.T_camera_frame, float)
-            steps["pose"] = np.concatenate([pose[:, :3, :3].reshape(-1, 9), pose[:, :3, 3]], 1)
-            steps["intrinsics"] = cameras.intrinsics_px
-            steps["sizes"][:, :4] = width, height, -(-width // _TILE), -(-height // _TILE)
-            self._views[cameras] = steps
-        return self._views[cameras]
 
     def keep(self, rows: np.ndarray) -> None:
         self._settle()
@@ -349,11 +348,11 @@ class _Loss:
     """A loss on the GPU that may not be final yet."""
 
     def __init__(self, fitter: CudaFitter, value: torch.Tensor) -> None:
-        self._fitter, self.value = fitter, value
+        self._fitter, self._value = fitter, value
 
     def __float__(self) -> float:
         self._fitter._settle()
-        return float(self.value)
+        return float(self._value)
 
 
 class _Recorder:
@@ -374,7 +373,10 @@ class _Recorder:
             try:
                 self._graphs[name] = self._record(do)
             except torch.cuda.OutOfMemoryError:
-                raise
+                # Graphs have memory of their own, beside that of steps which are not recorded.
+                self._possible = False
+                self._graphs.clear()
+                torch.cuda.empty_cache()
             except RuntimeError as error:
                 self._possible = False
                 logger.warning("CUDA cannot record optimization steps, which are slower without: %s", error)
@@ -386,6 +388,7 @@ class _Recorder:
 
     def _record(self, do: Callable[[], None]) -> torch.cuda.CUDAGraph:
         graph = torch.cuda.CUDAGraph()
+        torch.cuda.empty_cache()  # while it records, torch does not give back what it holds
         self._stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(self._stream):
             graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")

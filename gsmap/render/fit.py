@@ -29,8 +29,8 @@ def make_fitter(
     """Create the fitter of a backend; see `Fitter`.
 
     Args:
-        backend: see `gsmap.render.render`. The native fitter gives the same bits for any number of threads; gsplat adds
-            gradients in another order in every run.
+        backend: see `gsmap.render.render`. The native fitter gives the same bits for any number of threads; that of
+            a GPU adds gradients in another order in every run.
 
     Raises:
         ConfigError: the backend is unknown.

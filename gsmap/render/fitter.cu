@@ -267,7 +267,7 @@ extern "C" __global__ void project(const Step *step, const float *means, const f
 }
 
 // One thread for each Gaussian in order of depth. Writes the tile and the Gaussian of every entry; what lies beyond the
-// last entry gets the largest number as its tile. If there are more entries than room, it only says so, and the kernels
+// last entry gets the largest number as its tile. If there are more entries than room, it sets OVERFLOW, and the kernels
 // after it do nothing.
 extern "C" __global__ void list_tiles(const Step *step, const float4 *records, const long long *order,
                                       const long long *upto, const int *counts, int n, int capacity, int narrow,
@@ -300,7 +300,7 @@ extern "C" __global__ void list_tiles(const Step *step, const float4 *records, c
 
 // --- blending --------------------------------------------------------------------------------------------------------
 
-// Whether a Gaussian may reach alpha 1/255 at the centres of a block of pixels whose first is (x, y).
+// Returns true if a Gaussian may reach alpha 1/255 at the centres of a block of pixels whose first is (x, y).
 __device__ bool touches(const Record &g, int x, int y) {
     const float x0 = x + 0.5f - g.x, x1 = x0 + (BLOCK - 1), y0 = y + 0.5f - g.y, y1 = y0 + (BLOCK - 1);
     const float dx = fminf(fmaxf(0.f, x0), x1), dy = fminf(fmaxf(0.f, y0), y1);
@@ -320,8 +320,8 @@ __device__ bool touches(const Record &g, int x, int y) {
     return least <= g.log2_opacity + LOG2_255 + 0.01f;
 }
 
-// Whether the loss looks at a block of pixels or within reach of it; called by a whole warp.
-__device__ bool looked_at(const Step &view, int x0, int y0) {
+// Returns true if the loss looks at a block of pixels or within reach of it; called by a whole warp.
+__device__ bool is_looked_at(const Step &view, int x0, int y0) {
     constexpr int REACHED = BLOCK + 2 * REACH;
     bool any = !view.mask;
     for (int i = threadIdx.x % WARP; i < REACHED * REACHED && !any; i += WARP) {
@@ -347,7 +347,7 @@ extern "C" __global__ void blend(const Step *step, const Options *options, const
     float t[2] = {1.f, 1.f}, c[2][3] = {};
     int final[2] = {-1, -1}, y[2];
     bool alive[2];
-    const bool statistics = options->statistics, wanted = statistics || looked_at(view, x0, y0);
+    const bool statistics = options->statistics, wanted = statistics || is_looked_at(view, x0, y0);
     for (int p = 0; p < 2; p++) {
         y[p] = y0 + lane / BLOCK + 4 * p;
         alive[p] = wanted && x < view.width && y[p] < view.height;
@@ -379,7 +379,7 @@ extern "C" __global__ void blend(const Step *step, const Options *options, const
                 const float exponent = g.log2_opacity - u * u - w * w;
                 if (!alive[p] || exponent < -LOG2_255) continue;
                 const float alpha = fminf(power_of_two(exponent), MAX_ALPHA), weight = alpha * t[p], rest = t[p] - weight;
-                if (!(rest > MIN_TRANSMITTANCE)) {  // who would fall to 1e-4 stops before
+                if (!(rest > MIN_TRANSMITTANCE)) {  // a pixel that would fall to 1e-4 stops before
                     alive[p] = false;
                     continue;
                 }
@@ -526,9 +526,9 @@ __device__ __forceinline__ Square square_of(const Step &v, int index) {
     return {of % across * SQUARE, of / across * SQUARE, index % 3};
 }
 
-// Blur M maps along rows.
-template <int M>
+// Blur three maps along rows.
 __device__ __forceinline__ void blur_rows(const float (*maps)[WIDE][WIDE + 1], float (*across)[WIDE][SQUARE + 1]) {
+    constexpr int M = 3;
     for (int i = threadIdx.x; i < WIDE * (SQUARE / FOUR); i += THREADS) {
         const int row = i % WIDE, column = i / WIDE * FOUR;
         float sum[M][FOUR] = {};
@@ -599,7 +599,13 @@ extern "C" __global__ void loss_slopes(const Step *step, const Options *options,
         for (int o = 0; o < FOUR; o++) {
             const int y = at.y + row + o, pixel = y * view.width + x;
             if (x >= view.width || y >= view.height) continue;
-            const float w = mask_at(view, pixel), d = fabsf(channel[pixel] - target_at(view, 3 * pixel + at.channel));
+            const float w = mask_at(view, pixel);
+            if (w == 0.f) {  // whatever the target is there
+                if (ssim)
+                    for (int m = 0; m < 3; m++) slopes[(3 * m + at.channel) * plane + pixel] = 0.f;
+                continue;
+            }
+            const float d = fabsf(channel[pixel] - target_at(view, 3 * pixel + at.channel));
             mine[HUBER] += w * (d < delta ? d * d / (2.f * delta) : d - 0.5f * delta);
             mine[WEIGHT] += w;
             if (!ssim) continue;
@@ -637,7 +643,7 @@ extern "C" __global__ void loss_gradient(const Step *step, const Options *option
     const float ssim = options->ssim_weight, delta = options->huber_delta;
     const float scale = (sums[WEIGHT] > 0.f ? 1.f / sums[WEIGHT] : 0.f) / options->views;
     if (blockIdx.x == 0 && threadIdx.x == 0)
-        sums[LOSS] += scale * ((1.f - ssim) * sums[HUBER] + ssim * (sums[WEIGHT] - sums[SIMILAR]));
+        sums[LOSS] += scale * ((1.f - ssim) * sums[HUBER] + ssim * (sums[WEIGHT] - sums[SIMILAR]));  // 0 without weights
     for (int index = blockIdx.x; index < num_squares(view); index += gridDim.x) {
         const Square at = square_of(view, index);
         const int column = threadIdx.x % SQUARE, row = threadIdx.x / SQUARE * FOUR, x = at.x + column;
@@ -650,18 +656,21 @@ extern "C" __global__ void loss_gradient(const Step *step, const Options *option
                 for (int m = 0; m < 3; m++) maps[m][i / WIDE][i % WIDE] = there ? from[3 * m * plane] : 0.f;
             }
             __syncthreads();
-            blur_rows<3>(maps, across);
+            blur_rows(maps, across);
             __syncthreads();
             blur_column<3>(across, row, column, sum);
         }
         for (int o = 0; o < FOUR; o++) {
             const int y = at.y + row + o, pixel = y * view.width + x;
             if (x >= view.width || y >= view.height) continue;
-            const float p = image[at.channel * plane + pixel], q = target_at(view, 3 * pixel + at.channel), d = p - q;
+            const float w = mask_at(view, pixel), p = image[at.channel * plane + pixel];
+            float q = target_at(view, 3 * pixel + at.channel);
+            if (w == 0.f && !isfinite(q)) q = 0.f;  // whatever the target is there
+            const float d = p - q;
             const float slope = fabsf(d) < delta ? d / delta : d > 0.f ? 1.f : d < 0.f ? -1.f : 0.f;
-            float out = (1.f - ssim) * mask_at(view, pixel) * slope;
+            float out = (1.f - ssim) * w * slope;
             if (ssim > 0.f) out -= ssim * (sum[0][o] + 2.f * p * sum[1][o] + q * sum[2][o]);
-            gradient[at.channel * plane + pixel] = scale * out;
+            gradient[at.channel * plane + pixel] = scale > 0.f ? scale * out : 0.f;
         }
         if (ssim > 0.f) __syncthreads();
     }

@@ -94,7 +94,11 @@ class Fitter(ABC):
         options: FitOptions | None = None,
     ) -> None:
         self.learning_rates = learning_rates or LearningRates()
-        self.options = options or FitOptions()
+        self._options = options or FitOptions()
+
+    @property
+    def options(self) -> FitOptions:
+        return self._options
 
     @abstractmethod
     def __len__(self) -> int: ...

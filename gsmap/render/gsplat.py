@@ -165,16 +165,22 @@ class _DeviceCache:
                 self._entries.move_to_end(key)
                 return self._entries[key][1]
             moved = DrawableGaussians.of(GaussianTensors.of(gaussians, device=str(device())))
-            self._entries[key] = weakref.ref(gaussians, lambda _: self._entries.pop(key, None)), moved
-            while len(self._entries) > 1 and sum(d.nbytes for _, d in self._entries.values()) > _cache_bytes():
+            self._entries[key] = weakref.ref(gaussians, lambda _: self._forget(key)), moved
+            while len(self._entries) > 1 and sum(d.nbytes for _, d in [*self._entries.values()]) > _cache_bytes():
                 self._entries.popitem(last=False)
             return moved
 
     def clear(self) -> None:
-        self._entries.clear()
+        with self._lock:
+            self._entries.clear()
+
+    def _forget(self, key: int) -> None:
+        with self._lock:
+            self._entries.pop(key, None)
 
 
 _device_cache = _DeviceCache()
+_one_at_a_time = threading.Lock()
 
 
 def _cache_bytes() -> int:
@@ -233,9 +239,15 @@ def in_batches(count: int, size: int, do: Callable[[int, int], None]) -> None:
             _device_cache.clear()
             if device().type == "cuda":
                 torch.cuda.empty_cache()
-            if size == 1:
-                raise DeviceMemoryError(str(error)) from error
-            size = max(1, (last - first) // 2)
+            if size > 1:
+                size = max(1, (last - first) // 2)
+                continue
+            with _one_at_a_time:  # other threads may have taken the memory
+                try:
+                    do(first, last)
+                except torch.cuda.OutOfMemoryError:
+                    raise DeviceMemoryError(str(error)) from error
+            first = last
         else:
             first = last
 

@@ -1,7 +1,7 @@
-"""gsplat on the CPU: its own torch functions in place of its CUDA functions, under its real `rasterization`.
+"""The CUDA backend on the CPU: gsplat's torch functions in place of its CUDA functions, and gsmap's kernels emulated.
 
 Where gsplat's torch functions themselves need a GPU (to list what a pixel is blended from) the list is made here. What
-runs is gsmap's adapter, gsplat's glue and gsplat's reference mathematics: everything but the CUDA kernels.
+runs is everything but gsplat's CUDA kernels.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ def gsplat_on_cpu(monkeypatch):
     if importlib.util.find_spec("gsplat") is None:
         pytest.skip("needs the package gsplat (its Python part): pip install gsplat")
     import gsplat as package
-    from gsplat import rendering
 
     functions = {
         "fully_fused_projection": _projection,
@@ -38,7 +37,6 @@ def gsplat_on_cpu(monkeypatch):
         "rasterize_to_pixels": _rasterize_to_pixels,
     }
     for name, function in functions.items():
-        monkeypatch.setattr(rendering, name, function)
         monkeypatch.setattr(package, name, function)
     monkeypatch.setattr(gsplat, "load", lambda: package)
     monkeypatch.setattr(gsplat, "device", lambda: torch.device("cpu"))
@@ -65,7 +63,7 @@ def _emulated_kernels():
 def _launch(file, kernel, blocks, threads, *arguments, shared=0, num_sh=None):
     values = [ctypes.c_void_p(a.data_ptr()) if isinstance(a, torch.Tensor) else ctypes.c_int32(a) for a in arguments]
     pointers = (ctypes.c_void_p * len(values))(*(ctypes.cast(ctypes.byref(v), ctypes.c_void_p) for v in values))
-    assert not _emulated_kernels().launch(kernel.encode(), blocks, threads, pointers)
+    assert not _emulated_kernels().launch(kernel.encode(), blocks, threads, shared, pointers)
 
 
 def _projection(means, covars, quats, scales, viewmats, Ks, width, height, opacities=None, packed=False, **options):

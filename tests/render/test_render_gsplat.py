@@ -1,4 +1,6 @@
-"""The CUDA backend against the native one: on a GPU where there is one, and everywhere on gsplat's torch functions."""
+"""The CUDA backend against the native one: on a GPU where there is one, and everywhere by `gsplat_reference`."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -164,13 +166,54 @@ def test_a_step_whose_entries_do_not_fit_is_taken_again(device, monkeypatch):
         for _ in range(3):
             losses.append(fitter.step(cameras, image))
             fitter._settle()
-            assert fitter._entries_before[cameras] > 80
+            [(camera, entries)] = fitter._entries_before.items()
+            assert entries > 80
             if too_small:
-                fitter._entries_before[cameras] = 20
+                fitter._entries_before[camera] = 20
         losses = [float(loss) for loss in losses]
         after.append((losses, fitter.gaussians().means))
     assert after[0][0] == pytest.approx(after[1][0], rel=1e-5)
     assert np.allclose(after[0][1], after[1][1], atol=1e-6)
+
+
+def test_a_step_that_fails_halfway_leaves_nothing_for_the_next(device, monkeypatch):
+    gaussians, cameras = scene(n=60, views=2, size=(24, 16))
+    image = np.zeros((2, 16, 24, 3), np.float32)
+    fitters = [make_fitter(gaussians, backend="gsplat") for _ in range(2)]
+    blend, calls = CudaFitter._blend, []
+
+    def second_fails(*args):
+        calls.append(args)
+        if len(calls) == 2:
+            raise torch.cuda.OutOfMemoryError("no memory")
+        blend(*args)
+
+    monkeypatch.setattr(CudaFitter, "_blend", second_fails)
+    with pytest.raises(torch.cuda.OutOfMemoryError):
+        fitters[0].step(cameras, image)
+    monkeypatch.undo() if device == "cuda" else monkeypatch.setattr(CudaFitter, "_blend", blend)
+    for fitter in fitters:
+        fitter.step(cameras, image)
+    assert np.allclose(*(fitter.gaussians().means for fitter in fitters), atol=1e-6)
+
+
+@pytest.mark.parametrize("wide", [1 << 15, 0])
+def test_no_gaussians_and_what_the_mask_leaves_out(device, monkeypatch, wide):
+    monkeypatch.setattr("gsmap.render.cuda_fit._WIDE", wide)
+    gaussians, cameras = scene(n=60, views=2, size=(24, 16))
+    image = np.full((2, 16, 24, 3), 0.5, np.float32)
+    mask = np.ones((2, 16, 24), np.float32)
+    mask[:, :, 12:] = 0
+    unknown = image.copy()
+    unknown[:, :, 20:] = np.nan  # farther than the window of SSIM reaches
+    options, rates = FitOptions(ssim_weight=0.2, betas=(0.0, 0.0), epsilon=1e3), LearningRates(*[1e3] * 6)
+    for some in (gaussians, gaussians[:0]):
+        for pictures, weights in ((image, None), (unknown, mask), (unknown, 0 * mask)):
+            fitters = [make_fitter(some, rates, options=options, backend=name) for name in ("native", "gsplat")]
+            known = np.nan_to_num(pictures)  # the native loss is not a number there
+            wanted, found = (float(f.step(cameras, p, weights)) for f, p in zip(fitters, (known, pictures)))  # noqa: B905
+            assert found == pytest.approx(wanted, rel=1e-4)
+            assert np.allclose(*(fitter.gaussians().means for fitter in fitters), atol=1e-5)
 
 
 @pytest.mark.skipif(not gsplat_available(), reason="needs gsplat and a CUDA GPU")
@@ -215,7 +258,9 @@ def test_ten_steps_match_the_native_fitter(device, k, views, masked, frozen, sta
     )
     assert isinstance(other, CudaFitter)
     images, weights = other.load(target), None if masks is None else other.load(masks)
-    for _ in range(10):
+    for step in range(10):
+        for fitter in (native, other):
+            fitter.learning_rates = replace(rates, means=rates.means / (1 + step))
         a, b = native.step(cameras, target, masks), float(other.step(cameras, images, weights))
         assert a == pytest.approx(b, rel=1e-3)
     for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
@@ -253,19 +298,29 @@ def test_what_no_camera_sees_stays_where_it_is(device):
 def test_keep_and_append_carry_the_state(device):
     gaussians, cameras = scene(n=120, size=(48, 33))
     image = np.zeros((1, 33, 48, 3), np.float32)
-    fitters = [make_fitter(gaussians, frozen=np.arange(120) < 30, backend=name) for name in ("native", "gsplat")]
+    options = FitOptions(statistics=True)
+    fitters = [
+        make_fitter(gaussians, frozen=np.arange(120) < 30, options=options, backend=name)
+        for name in ("native", "gsplat")
+    ]
     rows = np.arange(120) % 2 == 0
     for fitter in fitters:
-        fitter.step(cameras, image)
+        for _ in range(3):  # recorded from the second on
+            fitter.step(cameras, image)
         fitter.keep(rows)
-        fitter.append(gaussians[~rows])
+        fitter.append(gaussians[~rows], np.arange(60) < 10)
         assert len(fitter) == 120
+        for _ in range(3):
+            fitter.step(cameras, image)
+        fitter.reset_statistics()
         fitter.step(cameras, image)
     ours, theirs = (fitter.gaussians() for fitter in fitters)
-    assert np.linalg.norm(ours.means - theirs.means) < 1e-2 * np.linalg.norm(
-        ours.means - np.r_[gaussians.means[rows], gaussians.means[~rows]]
-    )
-    assert np.array_equal(theirs.means[:15], gaussians.means[rows][:15])
+    start = np.r_[gaussians.means[rows], gaussians.means[~rows]]
+    assert np.linalg.norm(ours.means - theirs.means) < 1e-2 * np.linalg.norm(ours.means - start)
+    held = np.r_[np.arange(15), np.arange(60, 70)]
+    assert np.array_equal(theirs.means[held], start[held])
+    assert np.array_equal(*(fitter.statistics().seen for fitter in fitters))
+    assert fitters[1].statistics().seen.max() == 1
 
 
 def test_batches_shrink_where_memory_runs_out_and_the_answer_stays(device, monkeypatch, caplog):

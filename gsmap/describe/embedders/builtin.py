@@ -48,6 +48,8 @@ def make(context: SceneContext, params: Params) -> BuiltinEmbedder:
 class BuiltinEmbedder:
     """Histograms of appearance and shape."""
 
+    is_thread_safe = True
+
     def __init__(self, up: np.ndarray | None, unit_m: float) -> None:
         self.weights = np.repeat(_WEIGHTS / np.linalg.norm(_WEIGHTS), _PARTS).astype(np.float32)
         self.up, self.unit_m = up, unit_m

@@ -211,7 +211,9 @@ def object_layer(
         ]
 
     views = enumerate(render_views(gaussians, sampled, params.longest_side_px, params.render_backend))
-    threads = 1 if chosen.kinds else None  # a model runs on one picture at a time
+    # A model runs on one picture at a time, and so does a plug-in that does not say otherwise.
+    are_safe = all(getattr(method, "is_thread_safe", False) for method in (segmenter, embedder))
+    threads = None if are_safe and not chosen.kinds else 1
     for i, regions in enumerate(map_ahead(find_regions, views, threads)):
         progress(i / len(sampled), f"objects, view {i + 1} of {len(sampled)}")
         blocked += regions is None

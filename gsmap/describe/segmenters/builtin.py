@@ -45,6 +45,8 @@ def make(context: SceneContext, params: Params) -> BuiltinSegmenter:
 class BuiltinSegmenter:
     """Masks of the surface's parts."""
 
+    is_thread_safe = True
+
     def __init__(self, params: Params, cloud: PointCloud, num_gaussians: int) -> None:
         self.part_of_gaussian = np.full(num_gaussians + 1, -1)  # the last row is for pixels where nothing was drawn
         if len(cloud):

@@ -30,6 +30,7 @@ class PerViewSegmenter:
     """Masks of the surface's parts without their part numbers."""
 
     parts: builtin.BuiltinSegmenter
+    is_thread_safe = True
 
     def segment(self, view: View) -> list[Mask]:
         """Return the masks of the segmenter ``builtin`` in a view, without their part numbers."""
