@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmap._native import local_planes as native_planes
-from gsmap.geometry.boxes import are_finite, box_around
+from gsmap.geometry.boxes import are_finite
 from gsmap.geometry.cells import cell_means
 from gsmap.geometry.colour import srgb_to_lab
 from gsmap.geometry.floaters import find_floaters
@@ -47,7 +47,8 @@ def surface_cloud(gaussians: Gaussians, min_opacity: float = 0.1) -> PointCloud:
 
 def downsample(points: np.ndarray, values: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean position and mean value of the points of each occupied grid cell; ``values`` is (N, 3)."""
-    return cell_means(points, values, cell, origin=box_around(points)[0] if len(points) else None)[:2]
+    low = np.array([column.min() for column in points.T]) if len(points) else None
+    return cell_means(points, values, cell, origin=low)[:2]
 
 
 def local_planes(points: np.ndarray, num_neighbours: int = 16) -> tuple[np.ndarray, np.ndarray]:

@@ -18,8 +18,10 @@ def srgb_to_lab(rgb: np.ndarray) -> np.ndarray:
     rgb = np.asarray(rgb)
     flat = rgb.reshape(-1, 3)
     if len(flat) > _BLOCK:
-        parts = [_lab(flat[i : i + _BLOCK]) for i in range(0, len(flat), _BLOCK)]
-        return np.concatenate(parts).reshape(rgb.shape)
+        from gsmap.geometry.threads import map_ahead  # imported here, as few colours do not need it
+
+        blocks = (flat[i : i + _BLOCK] for i in range(0, len(flat), _BLOCK))
+        return np.concatenate(list(map_ahead(_lab, blocks))).reshape(rgb.shape)
     return _lab(rgb)
 
 

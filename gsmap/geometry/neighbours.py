@@ -8,7 +8,6 @@ import numpy as np
 
 from gsmap._native import PointTree
 from gsmap.geometry.boxes import box_around
-from gsmap.geometry.cells import cell_labels
 
 _ACROSS = 64  # number of cells along the longest side of the grid in whose order points are visited
 _CHUNK = 100_000  # number of points per query, which bounds memory
@@ -16,12 +15,14 @@ _CHUNK = 100_000  # number of points per query, which bounds memory
 
 def spatial_order(points: np.ndarray, across: int) -> np.ndarray:
     """Return the rows of the points (N, 3) sorted by the cells of a grid with ``across`` cells along the longest
-    side."""
+    side, at most 65,534."""
     low, high = box_around(points) if len(points) else np.zeros((2, 3))
     span = float((high - low).max())
     if span <= 0:
         return np.arange(len(points))
-    return np.argsort(cell_labels(np.floor((points - low) * (across / span)))[0], kind="stable")
+    scale = across / span
+    x, y, z = (((points[:, k] - low[k]) * scale).astype(np.uint16) for k in range(3))
+    return np.lexsort((z, y, x))  # short keys are sorted by digits
 
 
 def chunks_of_neighbours(points: np.ndarray, k: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
