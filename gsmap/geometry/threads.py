@@ -22,9 +22,8 @@ def map_ahead(
     """Yield the results of a function, in the order of the items, while threads compute those of the next items.
 
     Args:
-        items: taken by the calling thread, at most two for each thread, and one, before their results.
-        threads: 1 runs the function in the calling thread; None takes as many as native kernels
-            have, at most `_MOST`.
+        items: taken by the calling thread; with T threads at most 2 T + 1 wait for their results.
+        threads: 1 runs the function in the calling thread; None takes as many as native kernels do, at most `_MOST`.
     """
     threads = min(num_threads(), _MOST) if threads is None else threads
     if threads == 1:

@@ -269,7 +269,7 @@ class CudaFitter(Fitter):
         self._sent = wanted
 
     def _send_steps(self, cameras: Cameras, targets: torch.Tensor, weights: torch.Tensor | None) -> bytes:
-        """Send cameras, and where their pictures lie, to the GPU; return the bytes that the cameras are."""
+        """Send cameras and the addresses of their pictures to the GPU; return the cameras as a key."""
         count = len(cameras)
         self._held = targets, weights  # until the GPU has read them
         steps = self._steps_sent[:count].numpy().view(_STEP)[:, 0]

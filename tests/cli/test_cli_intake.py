@@ -217,6 +217,10 @@ def test_an_export_of_the_maps_own_scenes_is_no_capture(tmp_path: Path) -> None:
         assert [row.id for row in m.scenes()] == [scene]
         with raises(InputError, code="own_export"):
             m.ingest(exported)
+        garden = splat()
+        garden.means[:] += 0.5
+        formats.write(tmp_path / "out" / "garden.ply", garden)  # beside the export, not of it
+        assert m.ingest(tmp_path / "out" / "garden.ply")[0].scene_name == "garden"
     with gsmap.map.create(tmp_path / "other.gsmap") as m:
         assert len(m.ingest(exported)) == 1
 

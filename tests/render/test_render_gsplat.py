@@ -47,6 +47,19 @@ def scene(k=4, n=250, views=1, size=(100, 70), opaque=3.5):
     return gaussians, Cameras(pose, np.repeat(cameras.intrinsics_px, views, 0), np.repeat([size], views, 0))
 
 
+def run_out_of_memory(monkeypatch, method):
+    """Let the second call of a method of the fitter fail."""
+    real, calls = getattr(CudaFitter, method), []
+
+    def second_fails(*args):
+        calls.append(args)
+        if len(calls) == 2:
+            raise torch.cuda.OutOfMemoryError("no memory")
+        real(*args)
+
+    monkeypatch.setattr(CudaFitter, method, second_fails)
+
+
 def elsewhere(cameras):
     """The cameras, moved to where they see nothing."""
     pose = cameras.T_frame_camera.copy()
@@ -179,22 +192,16 @@ def test_a_step_whose_entries_do_not_fit_is_taken_again(device, monkeypatch):
 def test_a_step_that_fails_halfway_leaves_nothing_for_the_next(device, monkeypatch):
     gaussians, cameras = scene(n=60, views=2, size=(24, 16))
     image = np.zeros((2, 16, 24, 3), np.float32)
-    fitters = [make_fitter(gaussians, backend="gsplat") for _ in range(2)]
-    blend, calls = CudaFitter._blend, []
-
-    def second_fails(*args):
-        calls.append(args)
-        if len(calls) == 2:
-            raise torch.cuda.OutOfMemoryError("no memory")
-        blend(*args)
-
-    monkeypatch.setattr(CudaFitter, "_blend", second_fails)
+    # As above, a step is the gradient: one of Adam would hide that it is twice as large.
+    options, rates = FitOptions(betas=(0.0, 0.0), epsilon=1e3), LearningRates(*[1e3] * 6)
+    fitters = [make_fitter(gaussians, rates, options=options, backend="gsplat") for _ in range(2)]
+    run_out_of_memory(monkeypatch, "_blend")
     with pytest.raises(torch.cuda.OutOfMemoryError):
         fitters[0].step(cameras, image)
-    monkeypatch.undo() if device == "cuda" else monkeypatch.setattr(CudaFitter, "_blend", blend)
     for fitter in fitters:
         fitter.step(cameras, image)
-    assert np.allclose(*(fitter.gaussians().means for fitter in fitters), atol=1e-6)
+    ours, theirs = (fitter.gaussians().sh for fitter in fitters)
+    assert np.abs(ours - theirs).max() < 1e-3 * np.abs(ours - gaussians.sh).max()
 
 
 @pytest.mark.parametrize("wide", [1 << 15, 0])
@@ -211,7 +218,8 @@ def test_no_gaussians_and_what_the_mask_leaves_out(device, monkeypatch, wide):
         for pictures, weights in ((image, None), (unknown, mask), (unknown, 0 * mask)):
             fitters = [make_fitter(some, rates, options=options, backend=name) for name in ("native", "gsplat")]
             known = np.nan_to_num(pictures)  # the native loss is not a number there
-            wanted, found = (float(f.step(cameras, p, weights)) for f, p in zip(fitters, (known, pictures)))  # noqa: B905
+            wanted = float(fitters[0].step(cameras, known, weights))
+            found = float(fitters[1].step(cameras, pictures, weights))
             assert found == pytest.approx(wanted, rel=1e-4)
             assert np.allclose(*(fitter.gaussians().means for fitter in fitters), atol=1e-5)
 
@@ -356,16 +364,7 @@ def test_a_fit_that_the_gpu_cannot_hold_runs_on_the_cpu(device, monkeypatch, cap
         return backend, [float(fitter.step(cameras, image)) for _ in range(3)]
 
     assert with_enough_memory(fit)[0] == "gsplat"
-    project = CudaFitter._project
-    calls = []
-
-    def second_fails(*args):
-        calls.append(args)
-        if len(calls) == 2:
-            raise torch.cuda.OutOfMemoryError("no memory")
-        project(*args)
-
-    monkeypatch.setattr(CudaFitter, "_project", second_fails)
+    run_out_of_memory(monkeypatch, "_project")
     assert with_enough_memory(fit) == fit("native")
     assert "runs on the CPU" in caplog.text
 
