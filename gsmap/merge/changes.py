@@ -11,6 +11,7 @@ import numpy as np
 
 from gsmap import compare
 from gsmap.compare import GONE, HIDDEN, OTHER_IN_FRONT, REPAINTED, SAME, UNSEEN, CaptureViews, Comparison
+from gsmap.geometry.boxes import inside
 from gsmap.geometry.neighbours import nearest_of
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.merge.exposure import apply_balance
@@ -30,6 +31,7 @@ MIN_CAMERAS = 12
 
 _SHOWS = 0.15  # smallest blending weight of disputed Gaussians in a disputed pixel
 _NEAR_M = 0.25  # fragments of a change are searched within this distance of it
+_FRINGE_M = 0.1  # Gaussians of a change lie at most so far outside of its box
 _NEGLIGIBLE_GAIN = 0.02
 _INTRUDES = 0.15  # smallest difference of colour in [0, 1] that a misfit causes in a view
 
@@ -110,7 +112,8 @@ def resolve_changes(
     scenes cost N comparisons. A Gaussian of the older scene is removed if it lies in free space of the newer scenes, or
     on a surface of another colour after exposure balancing. With ``best`` this holds only if the newer scenes also
     observed the place better; otherwise the Gaussians of the newer scene are removed. Gaussians that no newer scene
-    observed stay. Scenes without dates, or of one date, remove nothing.
+    observed stay. Scenes without dates, or of one date, remove nothing, and nothing is removed where a person rejected
+    the changes (`PosedScene.unchanged`).
 
     Args:
         scenes: scenes in the map frame.
@@ -135,11 +138,12 @@ def resolve_changes(
                 continue
             joined = compare.combine_views([(one.views, one.shows) for one in parts], scenes[i], max_views)
             found = compare.compare(views, joined)
-            verdict = _find_disagreement(views, joined, found, prefer)
+            verdict = _find_disagreement(views, joined, found, prefer, scenes[i].unchanged)
             exposures[i] = _exposure(found)
             keeps[i] &= ~verdict.removed
             if prefer == "newest":
                 beside = _beside(views.gaussians.means, joined, verdict)
+                beside &= ~_inside_any(views.gaussians.means, scenes[i].unchanged)
                 behind[i] = beside & (found.older.state == HIDDEN)
                 exposed = _exposed(views.gaussians, exposures[i])
                 keeps[i] &= ~_find_misfits(exposed, keeps[i] & beside, joined)
@@ -189,16 +193,29 @@ class _Disagreement:
     removed_newer: np.ndarray
 
 
-def _find_disagreement(older: CaptureViews, newer: CaptureViews, found: Comparison, prefer: Prefer) -> _Disagreement:
+def _find_disagreement(
+    older: CaptureViews, newer: CaptureViews, found: Comparison, prefer: Prefer, unchanged: np.ndarray
+) -> _Disagreement:
     removed = np.isin(found.older.state, (GONE, REPAINTED))
     replacing = np.isin(found.newer.state, (GONE, REPAINTED))
     replacing |= (found.newer.state != SAME) & _revealed(newer, found)
+    removed &= ~_inside_any(older.gaussians.means, unchanged)
+    replacing &= ~_inside_any(newer.gaussians.means, unchanged)
     removed_newer = np.zeros(len(replacing), dtype=bool)
     if prefer == "best":
         stays = removed & (older.sharpness > found.older.sharpness)
-        removed_newer = np.isin(found.newer.state, (GONE, REPAINTED)) & (newer.sharpness < found.newer.sharpness)
+        removed_newer = replacing & np.isin(found.newer.state, (GONE, REPAINTED))
+        removed_newer &= newer.sharpness < found.newer.sharpness
         removed, replacing = removed & ~stays, replacing & ~removed_newer
     return _Disagreement(removed, replacing, removed_newer)
+
+
+def _inside_any(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Return an (N,) mask of points (N, 3) in any of the boxes (K, 2, 3), or at most `_FRINGE_M` outside."""
+    out = np.zeros(len(points), dtype=bool)
+    for box in boxes:
+        out |= inside(points, box, _FRINGE_M)
+    return out
 
 
 def _revealed(newer: CaptureViews, found: Comparison) -> np.ndarray:

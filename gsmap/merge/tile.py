@@ -22,6 +22,7 @@ from gsmap.merge.reference_view_cache import (
     keys_of,
 )
 from gsmap.types import Cameras, Gaussians, MergeResult, PosedScene, ReferencePhoto, Sim3
+from gsmap.types.merging import no_boxes
 from gsmap.types.progress import Progress
 
 
@@ -39,6 +40,7 @@ class LazyScene:
         without: digest of the Gaussians that ``load`` leaves out; empty for none.
         load_within: as ``load``, but it may omit Gaussians outside of the box if that is cheaper.
         photos: kept photos of the scene, in the scene's frame and unit.
+        unchanged: as in `PosedScene`, in the map frame.
     """
 
     scene_id: str
@@ -50,6 +52,7 @@ class LazyScene:
     without: str = ""
     load_within: Callable[[np.ndarray], Gaussians] | None = None
     photos: tuple[ReferencePhoto, ...] = ()
+    unchanged: np.ndarray = field(default_factory=no_boxes)
 
     def centroid(self) -> np.ndarray | None:
         """(3,) mean of all means of the scene in the map frame; None if the scene is empty."""
@@ -113,7 +116,7 @@ def _read(scene: LazyScene, bounds: np.ndarray | None, reading: _Reading) -> Pos
     if bounds is None:
         photos = tuple(_placed(photo, S) for photo in scene.photos)
         whole = transform_gaussians(scene.load(None), S)
-        return PosedScene(whole, cameras, scene.scene_id, scene.captured_at, photos=photos)
+        return PosedScene(whole, cameras, scene.scene_id, scene.captured_at, photos=photos, unchanged=scene.unchanged)
     around_m = reading.looking_m + reading.reach_m + float((bounds[1] - bounds[0]).max())
     box = np.array([bounds[0] - reading.reading_m, bounds[1] + reading.reading_m])
     rows = None
@@ -135,7 +138,9 @@ def _read(scene: LazyScene, bounds: np.ndarray | None, reading: _Reading) -> Pos
     moved = transform_gaussians(read, S)
     place = RegionCache(lambda near: transform_gaussians(scene.load(near), S), around_m / S.scale)
     photos = tuple(replace(_placed(p, S), around=partial(place.of, p.camera.centers[0])) for p in scene.photos)
-    return PosedScene(moved, cameras, scene.scene_id, scene.captured_at, scene.centroid, reference_views, photos)
+    return PosedScene(
+        moved, cameras, scene.scene_id, scene.captured_at, scene.centroid, reference_views, photos, scene.unchanged
+    )
 
 
 def _placed(photo: ReferencePhoto, S: Sim3) -> ReferencePhoto:

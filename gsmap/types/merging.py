@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from gsmap.types.cameras import Cameras
 from gsmap.types.gaussians import Gaussians
+
+
+def no_boxes() -> np.ndarray:
+    """Return an array of no boxes, (0, 2, 3)."""
+    return np.empty((0, 2, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +49,8 @@ class PosedScene:
         reference_views: renders of its views (`gsmap.merge.reference_view_cache.PlacedReferenceViews`), given the
             longest side of an image in pixels; None where they are to be rendered from `gaussians`.
         photos: localized photos that show the place as this capture does.
+        unchanged: (K, 2, 3) boxes, map frame, in which a person rejected the changes since this capture: newer captures
+            make nothing outdated there.
     """
 
     gaussians: Gaussians
@@ -53,6 +60,7 @@ class PosedScene:
     centroid: Callable[[], np.ndarray | None] | None = None
     reference_views: Callable[[int], Any] | None = None
     photos: tuple[ReferencePhoto, ...] = ()
+    unchanged: np.ndarray = field(default_factory=no_boxes)
 
     def whole_centroid(self) -> np.ndarray | None:
         """Return the unweighted mean (3,) float64 of all Gaussian means of the capture, map frame; None without

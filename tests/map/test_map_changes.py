@@ -18,6 +18,7 @@ from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.geometry.boxes import moved_box
 from gsmap.geometry.rotations import exp_so3
 from gsmap.map import Map
+from gsmap.map.stages.export import Request, plan
 from gsmap.map.visits import Params, Visit, has_moved, pairs_of_visits
 from gsmap.types import Cameras, Change, ChangeReport, Gaussians, PosedScene, PoseGraph, ScenePose, Sim3
 
@@ -230,6 +231,35 @@ def test_words_on_changes(site: Map, seen: Seen) -> None:
             site.show_change(wrong)
     with raises(NotFoundError, code="change_not_found"):
         site.confirm("c9")
+
+
+def test_an_export_overrules_nothing_where_every_change_was_rejected(site: Map, seen: Seen, tmp_path: Path) -> None:
+    def made_again() -> int:
+        return site.export(tmp_path / "out", format="ply", tile_size_m=0, steps=0).recomputed
+
+    def places() -> dict[str, np.ndarray]:
+        planned = plan(site.store, Request(tile_size_m=0.0), site.settings)
+        assert set(planned.recipe.unchanged) == set(planned.unchanged)
+        return {site[scene].name: boxes for scene, boxes in planned.unchanged.items()}
+
+    site.changes()
+    assert (made_again(), made_again()) == (1, 0)
+    rows = [row for row in site.changes().changes if row.kind == "moved"]
+    assert len(rows) == 2
+    site.reject(rows[0].id)
+    assert places() == {}  # the chair moved between the other two visits
+    assert made_again() == 0
+    site.reject(rows[1].id)
+    site.with_settings({"change.min_confidence": 0.3})
+    found = places()
+    assert set(found) == {"may", "june"}
+    np.testing.assert_allclose(found["may"][0], CHAIR, atol=1e-6)
+    assert any(row.what == "dirty_tiles" for row in site.status().todo)
+    assert (made_again(), made_again()) == (1, 0)
+    place(site, Sim3(exp_so3(np.array([0, 0, np.pi / 2])), np.array([5.0, 0, 0]), 2.0))  # half metres, turned
+    np.testing.assert_allclose(places()["may"][0], [[2, 0, 0], [2.5, 0.5, 1]], atol=1e-5)
+    site.reject(rows[0].id, withdraw=True)
+    assert places() == {}
 
 
 def test_status_counts_the_open_changes_that_are_listed(site: Map, seen: Seen) -> None:

@@ -41,6 +41,18 @@ def test_what_a_later_capture_looked_through_is_gone():
         assert resolve_changes([replace(old, captured_at=when), new]).num_removed == [0, 0]
 
 
+def test_nothing_is_outdated_where_the_changes_were_rejected():
+    old, new = dated("old", 2020, wall(0, -1.5, 1.5), box(5)), dated("new", 2021, wall(1, -1.5, 1.5))
+    around = np.array([[[-0.2, -0.15, -0.5], [0.2, 0.15, -0.5]]])
+    assert resolve_changes([replace(old, unchanged=around), new]).num_removed == [0, 0]
+    # Beside the rejected place, and where the older one is preferred, all is as before.
+    beside = replace(old, unchanged=around + np.array([2.0, 0, 0]))
+    assert resolve_changes([beside, new]).num_removed == resolve_changes([old, new]).num_removed
+    bare, boxed = dated("old", 2020, wall(0, -1.5, 1.5)), dated("new", 2021, wall(1, -1.5, 1.5), box(5))
+    once = replace(boxed, cameras=cameras_facing([0.0], distance=3.6))
+    assert resolve_changes([replace(bare, unchanged=around), once], "best").num_removed == [0, 0]
+
+
 def test_an_older_capture_in_another_exposure_loses_no_more_beside_what_went():
     scene = Gaussians.concatenate([wall(1, -1, 1, colour=plain), box(5)])
     old = dated("old", 2020, apply_gain(scene, np.full(3, 0.6)))

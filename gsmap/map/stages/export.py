@@ -25,6 +25,7 @@ from gsmap.geometry.transforms import transform_cameras
 from gsmap.map.date_filter import end_of_date, is_until, undated_note
 from gsmap.map.jobs import TileMaker
 from gsmap.map.metric_scales import map_metres, metre_notes
+from gsmap.map.rejected_changes import rejected_places
 from gsmap.map.settings import Settings
 from gsmap.map.shared_jobs import note_interruption
 from gsmap.map.stages.change import standing_comparisons
@@ -121,6 +122,7 @@ class ExportPlan:
         world: georeferenced components.
         passing: dynamic content to leave out of each scene.
         photos: reference photos by component and tile name.
+        unchanged: places of rejected changes (`gsmap.map.rejected_changes`).
     """
 
     revision: int | None
@@ -134,6 +136,7 @@ class ExportPlan:
     world: Mapping[int, GeoreferencedComponent] = field(default_factory=dict)
     passing: Mapping[str, DynamicContent] = field(default_factory=dict)
     photos: Mapping[tuple[int, str], Sequence[StoredPhoto]] = field(default_factory=dict)
+    unchanged: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 def plan(store: Store, request: Request, settings: Settings, known: MapObjects | None = None) -> ExportPlan:
@@ -166,11 +169,15 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
     if request.as_of is not None:
         scenes, notes = _as_of(scenes, request.as_of)
         placed = {scene: placed[scene] for scene in scenes}
+    unchanged: dict[str, np.ndarray] = {}
     if uses_dates(method, params):
         recipe = recipe.with_dates({scene: found.captured_at for scene, found in scenes.items()})
         from gsmap.map.undated_overlaps import undated_notes  # imported here, as status does not need it
 
         notes += undated_notes(store, scenes.values())
+        if any(change.status == "rejected" for one in store.changes.current() for change in one.changes):
+            unchanged = rejected_places(standing_comparisons(store, settings), placed, metres)
+        recipe = replace(recipe, unchanged={scene: _digest_boxes(boxes) for scene, boxes in unchanged.items()})
     passing: dict[str, DynamicContent] = {}
     if request.static:
         from gsmap.map.objects import load_objects
@@ -201,7 +208,7 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
     )
     photos = _photos(store, tiles, photos_m(method, params), request.as_of)
     recipe = replace(recipe, photos={tile: _digest(kept) for tile, kept in photos.items()})
-    return ExportPlan(revision, scenes, method, params, recipe, tiles, notes, metres, world, passing, photos)
+    return ExportPlan(revision, scenes, method, params, recipe, tiles, notes, metres, world, passing, photos, unchanged)
 
 
 def _photos(
@@ -243,6 +250,10 @@ def _digest(kept: Sequence[StoredPhoto]) -> str:
         for photo, one in ((photo, photo.sighting) for photo in kept)
     ]
     return text_digest(canonical(plain(rows)))[:32]
+
+
+def _digest_boxes(boxes: np.ndarray) -> str:
+    return text_digest(canonical(plain(boxes.round(3))))[:32]
 
 
 def export(
@@ -395,6 +406,7 @@ def make_content(store: Store, planned: ExportPlan, settings: Settings, tile: Pl
         captured_at={scene: planned.scenes[scene].captured_at for scene in tile.poses},
         store=ReferenceViewCache(folder, settings.export.max_shared_bytes),
         passing={scene: planned.passing[scene] for scene in tile.poses if scene in planned.passing},
+        unchanged={scene: planned.unchanged[scene] for scene in tile.poses if scene in planned.unchanged},
         photos=_by_scene(planned.photos.get((tile.component, tile.name), ())),
     )
 
