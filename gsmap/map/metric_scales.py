@@ -32,7 +32,7 @@ def map_metres(store: Store, graph: PoseGraph | None) -> dict[int, MetricScale]:
         store.scenes.specified_metres(),
         {scene.id: scene.scale_policy for scene in store.scenes.summaries()},
     )
-    guesses = {graph.scene: graph.unit_m for graph in store.graphs.frames()}  # oldest first: the newest stays
+    guesses = {graph.scene: graph.unit_m for graph in store.graphs.list()}  # oldest first: the newest stays
     components: dict[int, list[tuple[SceneUnit, ScenePose]]] = {}
     low, high = PLAUSIBLE_M
     for pose in graph.poses.values() if graph else ():

@@ -12,7 +12,7 @@ from gsmap.store.arrays import Arrays, StagedGroup, StoredFile
 from gsmap.store.branches import OtherCatalogs
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.catalog_rows import located_files
-from gsmap.store.schema import files, graphs, groups, prepared_scenes, view_features
+from gsmap.store.schema import files, groups, results
 
 
 def has_group(connection: Connection, group_id: str) -> bool:
@@ -50,13 +50,13 @@ def unname(connection: Connection, group_id: str) -> None:
 
 
 def forget_derived(connection: Connection, scene: str) -> None:
-    """Delete the graphs, view features and preparation of a scene, as its stored Gaussians change."""
-    for table in (graphs, view_features, prepared_scenes):
-        made = table.c.scene == scene
-        old = list(connection.execute(select(table.c.group_id).where(made)).scalars())
-        connection.execute(delete(table).where(made))
-        for group in old:
-            unname(connection, group)
+    """Delete the results of one scene, as its stored Gaussians change."""
+    of_scene = results.c.scene == scene
+    old = connection.execute(select(results.c.group_id).where(of_scene, results.c.group_id.is_not(None)))
+    groups = set(old.scalars())
+    connection.execute(delete(results).where(of_scene))
+    for group in groups:
+        unname(connection, group)
 
 
 @contextlib.contextmanager

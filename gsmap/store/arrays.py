@@ -37,7 +37,7 @@ from gsmap.durable import (
 )
 from gsmap.errors import CorruptError, StoreError
 from gsmap.store import array_archive, layout
-from gsmap.store.column_types import KINDS, is_digest
+from gsmap.store.column_types import is_array_kind, is_digest
 from gsmap.store.error_translation import display_name, translate_errors
 from gsmap.store.layout import CHUNK_ROWS
 
@@ -296,11 +296,15 @@ class Arrays:
             with contextlib.suppress(OSError):
                 self._remove_staged(grave.name)
 
+    def kinds(self) -> list[str]:
+        """Return the kinds of the groups on disk."""
+        return [kind for kind in _names(self.root) if is_array_kind(kind) and is_folder(self.root / kind)]
+
     def groups(self) -> list[tuple[str, str]]:
         """Return (kind, name) of every group on disk, also of groups that no row names."""
         return [
             (kind, name)
-            for kind in KINDS
+            for kind in self.kinds()
             for name in _names(self.root / kind)
             if is_digest(name) and is_folder(self.root / kind / name)
         ]
@@ -308,13 +312,14 @@ class Arrays:
     def unknown_entries(self) -> list[str]:
         """Return the paths of entries that are not groups, which gsmap never touches."""
         groups = {f"{kind}/{name}" for kind, name in self.groups()}
-        kinds = [kind for kind in _names(self.root) if not (kind in KINDS and is_folder(self.root / kind))]
-        out = [kind for kind in kinds if kind != self.staging.name or not is_folder(self.staging)]
-        return out + [f"{k}/{name}" for k in KINDS for name in _names(self.root / k) if f"{k}/{name}" not in groups]
+        kinds = self.kinds()
+        out = [name for name in _names(self.root) if name not in kinds]
+        out = [name for name in out if name != self.staging.name or not is_folder(self.staging)]
+        return out + [f"{k}/{name}" for k in kinds for name in _names(self.root / k) if f"{k}/{name}" not in groups]
 
     def _group_folder(self, kind: str, name: str) -> Path:
         """Return the folder of a group after validating its name, which may come from an untrusted catalog."""
-        if kind not in KINDS or not is_digest(name):
+        if not is_array_kind(kind) or not is_digest(name):
             raise CorruptError(
                 f"{kind}/{name} is not the name of an array group; nothing was changed",
                 code="invalid_stored_name",

@@ -12,7 +12,8 @@ from sqlalchemy import Connection, Engine, Row, select, union
 
 from gsmap.store.arrays import StoredFile
 from gsmap.store.catalog import Catalog
-from gsmap.store.schema import files, graphs, scenes
+from gsmap.store.result_rows import GRAPHS
+from gsmap.store.schema import files, scenes
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +43,14 @@ def locate_all(catalog: Catalog) -> Iterator[None]:
     Only reads belong inside: they share one read transaction, and what this process writes there is not seen.
     """
     living = select(scenes.c.id).where(scenes.c.removed_at.is_(None))
-    mine = graphs.c.scene.in_(living)
+    of_living = GRAPHS.c.scene.in_(living)
     wanted = union(
-        select(scenes.c.group_id).where(scenes.c.removed_at.is_(None)), select(graphs.c.group_id).where(mine)
+        select(scenes.c.group_id).where(scenes.c.removed_at.is_(None)),
+        GRAPHS.select(GRAPHS.c.group_id).where(of_living),
     )
     with catalog.read() as connection:
         rows = connection.execute(select(scenes).where(scenes.c.removed_at.is_(None))).all()
-        described = connection.execute(select(graphs).where(mine).order_by(graphs.c.created_at)).all()
+        described = connection.execute(GRAPHS.select().where(of_living).order_by(GRAPHS.c.created_at)).all()
         held = connection.execute(
             select(files).where(files.c.group_id.in_(wanted)).order_by(files.c.group_id, files.c.path)
         ).all()

@@ -20,14 +20,18 @@ from gsmap.errors import CorruptError, GsmapError, InputError
 from gsmap.texts import control_characters
 
 _DIGEST = re.compile(r"[0-9a-f]{32}|[0-9a-f]{64}")
-KINDS = ("scenes", "graphs", "changes", "indexes", "views", "photos", "prepared")
-"""Kinds of array groups: the folders below ``arrays``."""
+_ARRAY_KIND = re.compile(r"(?!staging$)[a-z]{1,32}")
 
 
 @lru_cache(maxsize=1 << 16)  # the same ids are read repeatedly
 def is_digest(text: str) -> bool:
     """Return True for 32 or 64 hex digits."""
     return _DIGEST.fullmatch(text) is not None
+
+
+def is_array_kind(text: str) -> bool:
+    """Return True for the name of a kind of array groups, which is a folder beside ``arrays/staging``."""
+    return _ARRAY_KIND.fullmatch(text) is not None
 
 
 def is_relative(path: str) -> bool:
@@ -107,14 +111,24 @@ class PairText(_CheckedText):
         return all(map(is_digest, value.split(":"))) and value.count(":") == 1
 
 
+class SceneListText(_CheckedText):
+    """Scene ids separated by spaces."""
+
+    cache_ok = True
+    what = "digests separated by spaces"
+
+    def is_valid(self, value: str) -> bool:
+        return all(map(is_digest, value.split(" ")))
+
+
 class ArrayKindText(_CheckedText):
     """The kind of an array group: the name of a folder."""
 
     cache_ok = True
-    what = " or ".join(KINDS)
+    what = "lower-case letters"
 
     def is_valid(self, value: str) -> bool:
-        return value in KINDS
+        return is_array_kind(value)
 
 
 class EnumText(_CheckedText):
@@ -321,17 +335,28 @@ def _kept_arrays(value: Any) -> bool:
     return isinstance(value, dict) and all(isinstance(how, dict) for how in value.values())
 
 
-def is_member_list(value: Any) -> bool:
-    """Return True for the members of an index segment."""
-    return isinstance(value, list) and all(
+def is_index_segment(value: Any) -> bool:
+    """Return True for the metadata of an index segment."""
+    members = value.get("members") if isinstance(value, dict) else None
+    return isinstance(members, list) and all(
         isinstance(one, list)
         and len(one) == 5
         and all(isinstance(text, str) and is_digest(text) for text in one[:2])
         and all(isinstance(flag, bool) for flag in one[2:4])
         and _numbers(one[4])
         and one[4] > 0
-        for one in value
+        for one in members
     )
+
+
+def is_object_set(value: Any) -> bool:
+    """Return True for the metadata of an object set; `gsmap.store.objects` validates the rest."""
+    return isinstance(value, dict) and is_poses_by_scene(value.get("poses"))
+
+
+def is_counts(value: Any) -> bool:
+    """Return True for a dict of numbers that are not negative."""
+    return is_number_dict(value) and all(number >= 0 for number in value.values())
 
 
 def is_candidate_list(value: Any) -> bool:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sqlalchemy import Connection, Row, Text, delete, insert, select, true, type_coerce
+from sqlalchemy import Connection, Row, Text, true, type_coerce
 
 from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
@@ -17,15 +15,15 @@ from gsmap.store.array_groups import manifest, num_bytes, publish, unless_pruned
 from gsmap.store.arrays import Arrays, digest
 from gsmap.store.catalog import Catalog, next_timestamp
 from gsmap.store.catalog_rows import located_graphs
-from gsmap.store.column_types import corrupt_value, is_direction
 from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.store.graph_content import from_arrays, shapes_of, to_arrays
+from gsmap.store.result_rows import GRAPHS
 from gsmap.store.row_index_maps import RowIndexMaps
 from gsmap.store.scene_refs import resolve
-from gsmap.store.schema import graphs, scenes
+from gsmap.store.schema import scenes
 from gsmap.types import SceneGraph
 
-KIND = "graphs"
+KIND = GRAPHS.kind
 
 
 @dataclass(frozen=True)
@@ -54,16 +52,6 @@ class StoredGraph:
         return sum(self.layers.values())
 
 
-@dataclass(frozen=True)
-class GraphFrame:
-    """The scale and up direction of a scene frame that its graph estimates; the fields are those of `StoredGraph`."""
-
-    key: str
-    scene: str
-    unit_m: float
-    up: tuple[float, ...] | None
-
-
 class Graphs:
     """The scene graphs of a map, one per scene and recipe."""
 
@@ -71,7 +59,7 @@ class Graphs:
         self._catalog = catalog
         self._arrays = arrays
         self._rows = RowIndexMaps(catalog, arrays)
-        self._frames: dict[tuple[str, str], GraphFrame] = {}  # by key and array group; cached, since neither changes
+        self._listed: dict[tuple[str, str], StoredGraph] = {}  # by key and array group; cached, since neither changes
 
     def save(self, graph: SceneGraph, key: RecipeKey) -> StoredGraph:
         """Store a graph in place of one with the same key; saving the same graph again repairs its damaged arrays.
@@ -89,29 +77,36 @@ class Graphs:
             )
         arrays, about = to_arrays(self._with_whole_members(graph))
         group_id = digest(*arrays.values(), text=f"{key.digest}{about}")
-        row = {"key": key.digest, "scene": graph.scene_id, "num_nodes": graph.num_nodes, "about": about}
-        mine = graphs.c.key == key.digest
+        mine = GRAPHS.has_key(key)
         staging = self._arrays.stage(arrays, KIND, group_id)
         with translate_errors(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
-            old = connection.execute(select(graphs).where(mine)).first()
+            old = connection.execute(GRAPHS.select().where(mine)).first()
             known = manifest(connection, group_id)
             if not known or self._arrays.problems(KIND, group_id, known):
                 publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
             if old is not None and old.group_id == group_id:
                 return _stored(old)
             resolve(connection, graph.scene_id)
-            connection.execute(delete(graphs).where(mine))
+            connection.execute(GRAPHS.delete(mine))
             if old is not None and self._is_damaged(connection, old.group_id):
                 unname(connection, old.group_id)
-            when = next_timestamp(connection, graphs.c.created_at, graphs.c.scene == graph.scene_id)
-            made = {"recipe": recipes.save_recipe(connection, key), "group_id": group_id, "created_at": when}
-            connection.execute(insert(graphs), row | made)
-            return _stored(connection.execute(select(graphs).where(mine)).one())
+            of_scene = (GRAPHS.c.kind == KIND) & (GRAPHS.c.scene == graph.scene_id)
+            GRAPHS.insert(
+                connection,
+                key=key.digest,
+                recipe=recipes.save_recipe(connection, key),
+                scene=graph.scene_id,
+                num_items=graph.num_nodes,
+                about=about,
+                group_id=group_id,
+                created_at=next_timestamp(connection, GRAPHS.c.created_at, of_scene),
+            )
+            return _stored(connection.execute(GRAPHS.select().where(mine)).one())
 
     def find(self, key: RecipeKey | str) -> StoredGraph | None:
         """Return the record of the graph with this key or digest; None without such a graph."""
         with self._catalog.read() as connection:
-            row = connection.execute(select(graphs).where(graphs.c.key == recipes.digest_of(key))).first()
+            row = connection.execute(GRAPHS.select().where(GRAPHS.has_key(key))).first()
         return None if row is None else _stored(row)
 
     def load(self, ref: str, key: RecipeKey | str | None = None) -> SceneGraph | None:
@@ -138,10 +133,10 @@ class Graphs:
         """Return the row of the newest graph of a scene, or of the graph with a key."""
         if (known := located_graphs(connection, scene)) is not None:
             return next((row for row in reversed(known) if key in (None, row.key)), None)
-        query = select(graphs).where(graphs.c.scene == scene)
+        query = GRAPHS.select().where(GRAPHS.c.scene == scene)
         if key is not None:
-            query = query.where(graphs.c.key == key)
-        return connection.execute(query.order_by(graphs.c.created_at.desc()).limit(1)).first()
+            query = query.where(GRAPHS.c.key == key)
+        return connection.execute(query.order_by(GRAPHS.c.created_at.desc()).limit(1)).first()
 
     def _with_whole_members(self, graph: SceneGraph) -> SceneGraph:
         """Convert segment members to rows of the whole capture; see `gsmap.store.row_index_maps`."""
@@ -160,27 +155,27 @@ class Graphs:
     def num_bytes(self, ref: str) -> int:
         """Return the size of the arrays of all graphs of a scene, as written."""
         with self._catalog.read() as connection:
-            made = select(graphs.c.group_id).where(graphs.c.scene == resolve(connection, ref)).distinct()
+            made = GRAPHS.select(GRAPHS.c.group_id).where(GRAPHS.c.scene == resolve(connection, ref)).distinct()
             return sum(num_bytes(connection, group) for group in connection.execute(made).scalars())
 
     def stored_keys(self, keys: Iterable[RecipeKey | str]) -> set[str]:
         """Return, as digests, the keys that have a graph."""
         with self._catalog.read() as connection:
-            return recipes.stored_keys(connection, graphs.c.key, keys)
+            return recipes.stored_keys(connection, GRAPHS.c.key, keys, GRAPHS.c.kind == KIND)
 
     def damaged(self, keys: Iterable[RecipeKey | str]) -> set[str]:
         """Return, as digests, the keys whose graph differs from its file digests; reads every byte."""
         wanted = {recipes.digest_of(key) for key in keys}
         with self._catalog.read() as connection:
-            rows = connection.execute(select(graphs.c.key, graphs.c.group_id)).all()
+            rows = connection.execute(GRAPHS.select(GRAPHS.c.key, GRAPHS.c.group_id)).all()
             return {row.key for row in rows if row.key in wanted and self._is_damaged(connection, row.group_id)}
 
     def forget(self, keys: Iterable[RecipeKey | str]) -> None:
         """Delete graphs; the next prune reclaims their arrays."""
-        mine = graphs.c.key.in_({recipes.digest_of(key) for key in keys})
+        mine = GRAPHS.c.key.in_({recipes.digest_of(key) for key in keys})
         with self._catalog.write() as connection:
-            group_ids = connection.execute(select(graphs.c.group_id).where(mine)).scalars().all()
-            connection.execute(delete(graphs).where(mine))
+            group_ids = connection.execute(GRAPHS.select(GRAPHS.c.group_id).where(mine)).scalars().all()
+            connection.execute(GRAPHS.delete(mine))
             for group_id in group_ids:
                 unname(connection, group_id)
 
@@ -189,58 +184,33 @@ class Graphs:
 
     def groups(self) -> dict[str, str]:
         """Return the scene of every graph, by array group."""
-        query = select(graphs.c.group_id, graphs.c.scene)
+        query = GRAPHS.select(GRAPHS.c.group_id, GRAPHS.c.scene)
         with self._catalog.read() as connection:
             return {row.group_id: row.scene for row in connection.execute(query)}
 
     def node_counts(self) -> dict[str, int]:
         """Return the number of nodes of the newest graph of each living scene, by scene id."""
-        query = select(graphs.c.scene, graphs.c.num_nodes).join(scenes, scenes.c.id == graphs.c.scene)
+        query = GRAPHS.select(GRAPHS.c.scene, GRAPHS.c.num_items).join(scenes, scenes.c.id == GRAPHS.c.scene)
         with self._catalog.read() as connection:
-            rows = connection.execute(query.where(scenes.c.removed_at.is_(None)).order_by(graphs.c.created_at))
-            return {row.scene: row.num_nodes for row in rows}
-
-    def frames(self) -> list[GraphFrame]:
-        """Return the frame estimates of the graphs of all living scenes, oldest first.
-
-        Results are cached, because an update needs them several times.
-        """
-        names = (type_coerce(graphs.c.key, Text), type_coerce(graphs.c.group_id, Text))  # to be compared with
-        living = select(*names).join(scenes, scenes.c.id == graphs.c.scene)
-        query = living.where(scenes.c.removed_at.is_(None)).order_by(graphs.c.created_at)
-        with self._catalog.read() as connection:
-            wanted = [(key, group_id) for key, group_id in connection.execute(query).all()]
-            new = sorted(key for key, group_id in wanted if (key, group_id) not in self._frames)
-            if new:
-                some = graphs.c.key.in_(new) if len(new) <= recipes.MAX_NAMED_KEYS else true()
-                unread = select(graphs.c.key, graphs.c.scene, graphs.c.group_id, _ABOUT_TEXT).where(some)
-                for row in connection.execute(unread).all():
-                    if (row.key, row.group_id) not in self._frames:
-                        self._frames[row.key, row.group_id] = _parse_frame(row)
-        return [self._frames[one] for one in wanted]
+            rows = connection.execute(query.where(scenes.c.removed_at.is_(None)).order_by(GRAPHS.c.created_at))
+            return {row.scene: row.num_items for row in rows}
 
     def list(self) -> list[StoredGraph]:
-        """Return the graphs of all living scenes, oldest first."""
-        query = select(graphs).join(scenes, scenes.c.id == graphs.c.scene).where(scenes.c.removed_at.is_(None))
+        """Return the graphs of all living scenes, oldest first.
+
+        Parsed rows are cached, because an update needs them several times.
+        """
+        names = (type_coerce(GRAPHS.c.key, Text), type_coerce(GRAPHS.c.group_id, Text))  # to be compared with
+        living = GRAPHS.select(*names).join(scenes, scenes.c.id == GRAPHS.c.scene)
+        query = living.where(scenes.c.removed_at.is_(None)).order_by(GRAPHS.c.created_at)
         with self._catalog.read() as connection:
-            return [_stored(row) for row in connection.execute(query.order_by(graphs.c.created_at))]
-
-
-_ABOUT_TEXT = type_coerce(graphs.c.about, Text).label("about")
-_FRAME_JSON = re.compile(r'(\{"up":(?:null|\[[^][{}"]*\]),"unit_m":[^][{}",]+),')
-
-
-def _parse_frame(row: Row[Any]) -> GraphFrame:
-    """Parse the first two values of the metadata, without decoding the rest."""
-    try:
-        begins = _FRAME_JSON.match(row.about)
-        about = json.loads(row.about if begins is None else f"{begins[1]}}}")
-        up, unit_m = about["up"], about["unit_m"]
-        if isinstance(unit_m, (int, float)) and (up is None or is_direction(up)):
-            return GraphFrame(row.key, row.scene, float(unit_m), None if up is None else tuple(up))
-    except (ValueError, TypeError, KeyError, RecursionError):
-        pass
-    raise corrupt_value("graphs.about", row.about, "JSON of a graph")
+            wanted = [(key, group_id) for key, group_id in connection.execute(query).all()]
+            new = sorted(key for key, group_id in wanted if (key, group_id) not in self._listed)
+            if new:
+                some = GRAPHS.c.key.in_(new) if len(new) <= recipes.MAX_NAMED_KEYS else true()
+                for row in connection.execute(GRAPHS.select().where(some)).all():
+                    self._listed[row.key, row.group_id] = _stored(row)
+        return [self._listed[one] for one in wanted]
 
 
 def _stored(row: Row[Any]) -> StoredGraph:

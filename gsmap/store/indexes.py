@@ -14,12 +14,15 @@ from gsmap.store.array_groups import manifest, publish, unless_pruned, unname
 from gsmap.store.arrays import Arrays, StoredFile, digest
 from gsmap.store.branches import OtherCatalogs
 from gsmap.store.catalog import Catalog, now
+from gsmap.store.column_types import is_index_segment
 from gsmap.store.error_translation import NOT_KEPT, translate_errors
+from gsmap.store.result_rows import ResultRows
 from gsmap.store.scene_refs import living_ids
-from gsmap.store.schema import index_segments, lookups
+from gsmap.store.schema import lookups
 from gsmap.types.retrieval import Candidate, IndexArrays, IndexedScene
 
 KIND = "indexes"
+_SEGMENTS = ResultRows(KIND, is_index_segment)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +88,7 @@ class Indexes:
 
     def segments(self, key: str) -> list[StoredSegment]:
         """Return the segments with this recipe, oldest first, without reading arrays."""
-        query = select(index_segments).where(index_segments.c.key == key).order_by(index_segments.c.number)
+        query = _SEGMENTS.select().where(_SEGMENTS.c.key == key).order_by(_SEGMENTS.c.number)
         with self._catalog.read() as connection:
             rows = connection.execute(query).all()
             return [self._segment(row, manifest(connection, row.group_id)) for row in rows]
@@ -110,11 +113,10 @@ class Indexes:
         """
         member_rows = [[m.scene, m.graph, m.upright, m.metric, float(m.coarseness)] for m in members]
         group_id = digest(arrays.keys, arrays.starts, arrays.nodes, text=f"{key}{member_rows}")
-        row = {"key": key, "members": member_rows, "num_nodes": len(arrays.nodes), "group_id": group_id}
         content = {"keys": arrays.keys, "starts": arrays.starts, "nodes": arrays.nodes}
         staging = self._arrays.stage(content, KIND, group_id)
         with translate_errors(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
-            there = connection.execute(select(index_segments.c.group_id, index_segments.c.key)).all()
+            there = connection.execute(_SEGMENTS.select(_SEGMENTS.c.group_id, _SEGMENTS.c.key)).all()
             if not set(instead_of) <= {old.group_id for old in there}:
                 return False
             gone = {old.group_id for old in there if old.group_id in instead_of or old.key not in {key, *beside}}
@@ -123,7 +125,14 @@ class Indexes:
             if not known or self._arrays.problems(KIND, group_id, known):
                 publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
             if group_id not in {old.group_id for old in there} - gone:  # another process stored the same segment
-                connection.execute(insert(index_segments), row | {"created_at": now()})
+                _SEGMENTS.insert(
+                    connection,
+                    key=key,
+                    scenes=" ".join(m.scene for m in members) or None,
+                    num_items=len(arrays.nodes),
+                    about={"members": member_rows},
+                    group_id=group_id,
+                )
         self._drop(dropped - {group_id})
         return True
 
@@ -176,19 +185,22 @@ class Indexes:
                     connection.execute(update(lookups).where(mine).values(num_left=num_left[row.scene]))
 
     def _segment(self, row: Row[Any], files: tuple[StoredFile, ...]) -> StoredSegment:
-        members = [IndexedScene(scene, graph, bool(up), bool(metric), c) for scene, graph, up, metric, c in row.members]
-        if row.num_nodes < 0:
+        members = [
+            IndexedScene(scene, graph, bool(up), bool(metric), c)
+            for scene, graph, up, metric, c in row.about["members"]
+        ]
+        if row.num_items < 0:
             raise CorruptError(
-                f"the catalog holds the invalid value {row.num_nodes} in index_segments.num_nodes: restore the "
+                f"the catalog holds the invalid value {row.num_items} in results.num_items: restore the "
                 "catalog from a backup",
                 code="catalog_invalid",
             )
-        return StoredSegment(row.group_id, members, row.num_nodes, files, self._arrays, self._catalog)
+        return StoredSegment(row.group_id, members, row.num_items, files, self._arrays, self._catalog)
 
     @staticmethod
     def _unname(connection: Connection, ids: Collection[str]) -> set[str]:
         """Delete segments, and the rows that name their groups."""
-        connection.execute(delete(index_segments).where(index_segments.c.group_id.in_(sorted(ids))))
+        connection.execute(_SEGMENTS.delete(_SEGMENTS.c.group_id.in_(sorted(ids))))
         for group_id in ids:
             unname(connection, group_id)
         return set(ids)

@@ -23,6 +23,7 @@ from gsmap.store.catalog import Catalog, now
 from gsmap.store.change_rows import KIND as CHANGES
 from gsmap.store.change_rows import newest_of_all
 from gsmap.store.error_translation import PRUNE_MAY, translate_errors
+from gsmap.store.graphs import KIND as GRAPHS
 from gsmap.store.indexes import KIND as INDEXES
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.models import FOLDER, model_path, open_model
@@ -30,19 +31,17 @@ from gsmap.store.objects import forget_sets
 from gsmap.store.photos import KIND as PHOTOS
 from gsmap.store.photos import claimed_groups
 from gsmap.store.revisions import forget_dropped, scenes_in_kept_revisions
+from gsmap.store.scenes import KIND as SCENES
 from gsmap.store.schema import (
     CHUNK_BOXES,
     comparisons,
     files,
-    graphs,
     groups,
-    index_segments,
     models,
     photo_sightings,
-    prepared_scenes,
+    results,
     revisions,
     scenes,
-    view_features,
 )
 from gsmap.types.progress import Progress
 
@@ -203,7 +202,7 @@ def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run
     return PruneResult(
         scenes=tuple(name for name, _ in garbage.scenes),
         revisions=tuple(garbage.revisions),
-        num_graphs=len(garbage.graphs),
+        num_graphs=garbage.num_graphs,
         num_orphans=len(set(orphans.groups) - set(garbage.groups)),
         num_models=orphans.num_models,
         num_bytes=num_bytes,
@@ -308,14 +307,14 @@ class _Garbage:
     Args:
         revisions: numbers of the revisions that are not kept.
         scenes: names and numbers of removed scenes with arrays that no kept revision uses.
-        graphs: keys of their graphs.
+        num_graphs: number of their graphs.
         lost: ids of all removed scenes that no kept revision uses.
         groups: kinds and names of the groups without a referrer afterwards.
     """
 
     revisions: list[int]
     scenes: list[tuple[str, int]]
-    graphs: list[str]
+    num_graphs: int
     lost: set[str]
     groups: list[tuple[str, str]]
 
@@ -324,24 +323,20 @@ def _find_garbage(connection: Connection, keep_revisions: int | None) -> _Garbag
     dropped = _revisions_to_drop(connection, keep_revisions)
     named = scenes_in_kept_revisions(after=max(dropped, default=0))
     gone = scenes.c.removed_at.is_not(None) & scenes.c.id.not_in(named)
-    of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)
     dead = connection.execute(select(scenes).where(gone, scenes.c.group_id.is_not(None)))
-    keys = connection.execute(select(graphs.c.key).select_from(of_scene).where(gone)).scalars()
     claimed = set(connection.execute(select(scenes.c.group_id).where(not_(gone))).scalars())
-    claimed |= set(connection.execute(select(graphs.c.group_id).select_from(of_scene).where(not_(gone))).scalars())
     # The newest comparison of a pair is current while both of its scenes have arrays.
     lost = set(connection.execute(select(scenes.c.id).where(gone)).scalars())
     claimed |= {row.group_id for row in newest_of_all(connection) if not {row.older, row.newer} & lost}
-    claimed |= set(connection.execute(select(index_segments.c.group_id)).scalars())
-    for table in (view_features, prepared_scenes):
-        of_living = select(table.c.group_id).where(table.c.scene.not_in(lost))
-        claimed |= set(connection.execute(of_living).scalars())
+    derived = connection.execute(select(results.c.kind, results.c.scene, results.c.group_id)).all()
+    claimed |= {row.group_id for row in derived if row.scene not in lost}
+    num_graphs = sum(row.kind == GRAPHS and row.scene in lost for row in derived)
     claimed |= claimed_groups(connection, lost)
     known = {(g.kind, g.id) for g in connection.execute(select(groups))}
     return _Garbage(
         dropped,
         [(row.name, row.number) for row in dead],
-        list(keys),
+        num_graphs,
         lost,
         sorted(group for group in known if group[1] not in claimed),
     )
@@ -352,10 +347,8 @@ def _drop_rows(catalog: Catalog, garbage: _Garbage) -> None:
     with catalog.write() as connection:
         connection.execute(update(revisions).where(revisions.c.number.in_(garbage.revisions)).values(dropped_at=now()))
         forget_dropped(connection)
-        connection.execute(delete(graphs).where(graphs.c.key.in_(garbage.graphs)))
+        connection.execute(delete(results).where(results.c.scene.in_(garbage.lost)))
         forget_sets(connection, garbage.lost)
-        for table in (view_features, prepared_scenes):
-            connection.execute(delete(table).where(table.c.group_id.in_(ids)))
         for table in (scenes, comparisons, photo_sightings):
             connection.execute(update(table).where(table.c.group_id.in_(ids)).values(group_id=None))
         for _, number in garbage.scenes:
@@ -365,25 +358,29 @@ def _drop_rows(catalog: Catalog, garbage: _Garbage) -> None:
         connection.execute(delete(groups).where(groups.c.id.in_(ids)))
 
 
+_PURPOSE = {
+    SCENES: "",  # the message states it
+    INDEXES: "the retrieval index: gsmap builds it again when the next scene is added",
+    "views": "features of a scene's views: gsmap computes them again when the next photo is localized",
+    "prepared": "surface cells and renders of a scene: gsmap describe MAP SCENE forgets damaged ones, and the next "
+    "registration stores them again",
+    PHOTOS: "the preview of a kept photo: remove the photo and add it again",
+}
+
+
 def _advice(connection: Connection, kind: str, group: str, location: str | None) -> str:
     """Return the purpose of a damaged group and how to recompute it; empty if the message states this already."""
     if kind == CHANGES:
         return _comparison_advice(connection, group, location)
-    if kind == INDEXES:
-        return " (the retrieval index: gsmap builds it again when the next scene is added)"
-    if kind == "views":
-        return " (features of a scene's views: gsmap computes them again when the next photo is localized)"
-    if kind == "prepared":
-        return (
-            " (surface cells and renders of a scene: gsmap describe MAP SCENE forgets damaged ones, and the next "
-            "registration stores them again)"
-        )
-    if kind == PHOTOS:
-        return " (the preview of a kept photo: remove the photo and add it again)"
-    if kind != "graphs":
-        return ""
-    of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)
-    found = connection.execute(select(scenes).select_from(of_scene).where(graphs.c.group_id == group)).first()
+    if kind == GRAPHS:
+        return _graph_advice(connection, group, location)
+    purpose = _PURPOSE.get(kind, "computed from scenes: gsmap computes it again when it is needed")
+    return f" ({purpose})" if purpose else ""
+
+
+def _graph_advice(connection: Connection, group: str, location: str | None) -> str:
+    of_scene = results.join(scenes, scenes.c.id == results.c.scene)
+    found = connection.execute(select(scenes).select_from(of_scene).where(results.c.group_id == group)).first()
     if found is None:
         return f" (an unused graph: remove it with gsmap prune {quote(location)})" if location else ""
     if location is None:

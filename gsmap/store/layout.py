@@ -278,6 +278,7 @@ class ArrayLayout:
 def repair_advice(kind: str) -> str:
     """Return advice for a damaged group of this kind."""
     again = {
+        "scenes": "ingest the scene again",
         "graphs": "compute the graph again (gsmap describe MAP SCENE)",
         "changes": "compare its two scenes again (gsmap changes MAP A:B)",
         "views": "localize a photo: gsmap computes lost features again",
@@ -285,7 +286,7 @@ def repair_advice(kind: str) -> str:
         "photos": "remove the photo and add it again (gsmap localize MAP PHOTO --add)",
         "indexes": "add a capture: gsmap builds the index again",
     }
-    return f"run gsmap check, and {again.get(kind, 'ingest the scene again')}"
+    return f"run gsmap check, and {again.get(kind, 'gsmap computes it again when it is needed')}"
 
 
 def _require_codecs(codecs: Any) -> None:

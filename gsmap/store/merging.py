@@ -75,7 +75,7 @@ def merge(into: Store, source: Store) -> MergeResult:
     """
     with open_transfer(into, source) as transfer:
         transfer.scenes()
-        transfer.graphs()
+        transfer.results()
         transfer.pairs()
         transfer_comparisons(transfer)
         transfer_objects(transfer)
@@ -98,7 +98,7 @@ def split(source: Store, out: Store, chosen: Collection[str]) -> MergeResult:
     """
     with open_transfer(out, source, only=chosen) as transfer:
         transfer.scenes()
-        transfer.graphs()
+        transfer.results()
         transfer.pairs()
         transfer_comparisons(transfer)
         transfer_objects(transfer)
@@ -138,7 +138,7 @@ def import_scene(into: Store, source: Store, scene: str) -> MergeResult:
             _check_shared(transfer, scene)
         if into.scenes.removed_at(scene) is not None:  # an explicit request overrules the tombstone
             into.scenes.restore(scene)
-        transfer.graphs()
+        transfer.results()
         transfer.pairs()
         transfer_comparisons(transfer)
         transfer_objects(transfer)

@@ -23,7 +23,7 @@ import numpy as np
 from gsmap.errors import CorruptError, NotFoundError, StoreError
 from gsmap.store import array_archive, cache, layout
 from gsmap.store.arrays import Arrays, StagedGroup, StoredFile, stored_file
-from gsmap.store.column_types import KINDS, is_digest
+from gsmap.store.column_types import is_array_kind, is_digest
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.remote_map import RemoteMap
 from gsmap.store.storage import SINGLE_PUT_BYTES, chunks_of
@@ -207,7 +207,7 @@ class ObjectArrays(Arrays):
 
     def groups(self) -> list[tuple[str, str]]:
         found = {tuple(key.split("/")[1:3]) for key in self._storage.list(f"{_ROOT}/")}
-        return sorted((kind, name) for kind, name in found if kind in KINDS and is_digest(name))
+        return sorted((kind, name) for kind, name in found if is_array_kind(kind) and is_digest(name))
 
     def exists(self, kind: str, name: str) -> bool:
         return bool(self._storage.list(self._prefix(kind, name)))
@@ -234,7 +234,7 @@ class ObjectArrays(Arrays):
         return f"{self._prefix(kind, name)}{file.sha256[:32]}-{file.path}"
 
     def _prefix(self, kind: str, name: str) -> str:
-        if kind not in KINDS or not is_digest(name):
+        if not is_array_kind(kind) or not is_digest(name):
             raise CorruptError(
                 f"{kind}/{name} is not the name of an array group; nothing was changed",
                 code="invalid_stored_name",

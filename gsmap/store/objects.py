@@ -20,9 +20,11 @@ from gsmap.errors import CorruptError, GsmapError, InputError, NotFoundError
 from gsmap.methods import RecipeKey
 from gsmap.store import facts, recipes
 from gsmap.store.catalog import Catalog, now
+from gsmap.store.column_types import is_object_set
 from gsmap.store.facts import Fact
 from gsmap.store.matrices import from_array, from_pose, to_pose
-from gsmap.store.schema import object_facts, object_places, object_sets, objects
+from gsmap.store.result_rows import ResultRows
+from gsmap.store.schema import object_facts, object_places, objects
 from gsmap.types import MapObject, ObjectAnnotations, ObjectObservation, Room, Sim3
 from gsmap.types.map_object import OBSERVATION_STATES
 from gsmap.types.plain import plain
@@ -32,6 +34,7 @@ ObjectBoxes = Mapping[str, np.ndarray]
 
 # Minimum intersection over union of the boxes of one object in two computations, each padded by a fraction of the
 # larger one's diagonal because the box of a picture on a wall has almost no thickness.
+SETS = ResultRows("objects", is_object_set)
 _MIN_OVERLAP = 0.1
 _PAD = 0.03
 
@@ -112,7 +115,7 @@ class Objects:
             CorruptError: the catalog holds an invalid object set.
         """
         with self._catalog.read() as connection:
-            rows = connection.execute(select(object_sets).order_by(object_sets.c.number)).all()
+            rows = connection.execute(SETS.select().order_by(SETS.c.number)).all()
         return [_read(row) for row in rows]
 
     def save(self, parts: Sequence[ComputedObjects]) -> list[ObjectSet]:
@@ -167,14 +170,15 @@ class Objects:
         mine = {number_of(thing.id) for thing in own}
         self._update_split_objects(connection, part, [number for number in given if number not in mine])
         _replace_places(connection, new, made.poses)
-        value = {
-            "key": part.key.digest,
-            "recipe": recipes.save_recipe(connection, part.key),
-            "poses": {scene: from_pose(pose) for scene, pose in made.poses.items()},
-            "value": _value(kept),
-            "created_at": when,
-        }
-        connection.execute(insert(object_sets), value)
+        SETS.insert(
+            connection,
+            key=part.key.digest,
+            recipe=recipes.save_recipe(connection, part.key),
+            scenes=" ".join(made.poses),
+            num_items=len(kept.objects),
+            about={"poses": {scene: from_pose(pose) for scene, pose in made.poses.items()}, **_value(kept)},
+            created_at=when,
+        )
         return kept
 
     def _update_split_objects(self, connection: Connection, part: ComputedObjects, others: Collection[int]) -> None:
@@ -386,8 +390,8 @@ def _replace_places(connection: Connection, places: Mapping[int, ObjectBoxes], s
 def _numbers_in_use(connection: Connection, besides: Iterable[str] = ()) -> set[int]:
     """Return the numbers of objects in stored sets, without sets with any of the captures ``besides``."""
     out, others = set(), set(besides)
-    for row in connection.execute(select(object_sets)):
-        if not others & set(row.poses):
+    for row in connection.execute(SETS.select()):
+        if not others & set(row.about["poses"]):
             out |= {number for thing in _read(row).objects if (number := number_of(thing.id)) is not None}
     return out
 
@@ -453,15 +457,15 @@ def _check_acyclic(annotations: Mapping[int, ObjectAnnotations], number: int, sa
 def forget_sets(connection: Connection, scenes: Iterable[str]) -> int:
     """Delete the object sets that contain any of these captures; return their number."""
     gone = set(scenes)
-    rows = connection.execute(select(object_sets.c.number, object_sets.c.poses)).all()
-    numbers = [row.number for row in rows if gone & set(row.poses)]
-    connection.execute(delete(object_sets).where(object_sets.c.number.in_(numbers)))
+    rows = connection.execute(SETS.select(SETS.c.number, SETS.c.scenes)).all()
+    numbers = [row.number for row in rows if not gone.isdisjoint(row.scenes.split(" "))]
+    connection.execute(SETS.delete(SETS.c.number.in_(numbers)))
     return len(numbers)
 
 
 def forget_scene(connection: Connection, scene: str) -> dict[str, int]:
     """Delete the boxes of a capture, and facts about objects that no other capture shows; return row counts by noun."""
-    dropped = {"object_sets": forget_sets(connection, [scene])}
+    dropped = {}
     mine = object_places.c.scene == scene
     of_it = list(connection.execute(select(object_places.c.object).where(mine)).scalars())
     dropped["object_places"] = int(connection.execute(delete(object_places).where(mine)).rowcount)
@@ -496,7 +500,6 @@ def _value(made: ObjectSet) -> dict[str, Any]:
             }
             for room in made.rooms
         ],
-        "scenes": scenes,
         "things": [made.things.get(scene, "") for scene in scenes],
         "graphs": [made.graphs.get(scene, "") for scene in scenes],
         "boxes": [_box_or_none(made.boxes.get(scene)) for scene in scenes],
@@ -527,16 +530,16 @@ def _box_or_none(box: np.ndarray | None) -> list[list[float]] | None:
 
 def _read(row: Row[Any]) -> ObjectSet:
     try:
-        value = row.value
-        scenes = [str(scene) for scene in value["scenes"]]
-        if set(scenes) != set(row.poses):
+        value, poses = row.about, row.about["poses"]
+        scenes = row.scenes.split(" ")
+        if set(scenes) != set(poses):
             raise InputError("its captures are not those of its poses", code="invalid_record")
         things = dict(zip(scenes, map(str, value["things"]), strict=True))
         return ObjectSet(
             row.key,
             row.recipe or "",
             float(value["metres"]),
-            {scene: to_pose(pose) for scene, pose in row.poses.items()},
+            {scene: to_pose(pose) for scene, pose in poses.items()},
             things,
             _objects(value["objects"], scenes),
             _numbers(value["up"], (3,)),
@@ -550,7 +553,7 @@ def _read(row: Row[Any]) -> ObjectSet:
         )
     except (GsmapError, TypeError, ValueError, KeyError, IndexError, AttributeError, zlib.error) as error:
         raise CorruptError(
-            f"the catalog holds objects, in object_sets row {row.number}, that are invalid ({error}) and that "
+            f"the catalog holds objects, in results row {row.number}, that are invalid ({error}) and that "
             "gsmap did not write: restore the catalog from a backup",
             code="catalog_invalid",
         ) from error

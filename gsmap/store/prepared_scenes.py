@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,8 @@ from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
-from gsmap.store.derived_arrays import DerivedArrays
 from gsmap.store.layout import Shape
-from gsmap.store.schema import prepared_scenes
+from gsmap.store.results import DerivedArrays
 from gsmap.types import Cameras
 from gsmap.types.prepared_scene import PreparedScene
 
@@ -39,7 +39,7 @@ class PreparedScenes(DerivedArrays):
     """The prepared scenes of a map."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
-        super().__init__(catalog, arrays, prepared_scenes, KIND, _TYPES, "the surface cells and views of scene")
+        super().__init__(catalog, arrays, KIND, _TYPES, "the surface cells and views of scene")
 
     def save(self, found: PreparedScene, key: RecipeKey) -> None:
         """Store a prepared scene in place of all earlier ones of that scene.
@@ -61,14 +61,16 @@ class PreparedScenes(DerivedArrays):
             "image_colours": found.image_colours,
             "image_depths": found.image_depths,
         }
-        columns = {
-            "unit_m": float(found.unit_m),
-            "num_gaussians": len(found.is_surface),
-            "num_cells": len(found.points),
-            "num_views": len(found.cameras),
-            "num_own": found.num_own,
-        }
-        self.put(found.scene, key, {name: arrays[name].astype(_TYPES[name], copy=False) for name in arrays}, columns)
+        self.put(
+            found.scene,
+            key,
+            {name: arrays[name].astype(_TYPES[name], copy=False) for name in arrays},
+            unit_m=float(found.unit_m),
+            num_gaussians=len(found.is_surface),
+            num_items=len(found.points),
+            num_views=len(found.cameras),
+            num_own=found.num_own,
+        )
 
     def load(self, scene: str, key: RecipeKey | str) -> PreparedScene | None:
         """Load the prepared scene with this key; None without such a scene.
@@ -80,11 +82,11 @@ class PreparedScenes(DerivedArrays):
         return self.get(scene, key, _shapes, _prepared)
 
 
-def _shapes(row: Row[Any]) -> dict[str, Shape]:
-    M, V = row.num_cells, row.num_views
+def _shapes(about: Mapping[str, int]) -> dict[str, Shape]:
+    M, V = about["num_items"], about["num_views"]
     return {
         "centre": (1, 3),
-        "surface": (-(-row.num_gaussians // 8),),
+        "surface": (-(-about["num_gaussians"] // 8),),
         "points": (M, 3),
         "colours": (M, 3),
         "normals": (M, 3),
@@ -104,16 +106,16 @@ def _prepared(row: Row[Any], arrays: dict[str, np.ndarray]) -> PreparedScene:
             raise InputError(f"{name} hold NaN or infinity", code="not_finite")
     return PreparedScene(
         scene=row.scene,
-        unit_m=row.unit_m,
+        unit_m=float(row.about["unit_m"]),
         centre=arrays["centre"][0],
-        is_surface=np.unpackbits(arrays["surface"], count=row.num_gaussians).astype(bool),
+        is_surface=np.unpackbits(arrays["surface"], count=int(row.about["num_gaussians"])).astype(bool),
         points=arrays["points"],
         colours=arrays["colours"],
         normals=arrays["normals"],
         sides=arrays["sides"],
         sample=arrays["sample"],
         cameras=Cameras(arrays["poses"].reshape(-1, 4, 4), arrays["intrinsics"], arrays["sizes"]),
-        num_own=row.num_own,
+        num_own=int(row.about["num_own"]),
         image_colours=arrays["image_colours"],
         image_depths=arrays["image_depths"],
     )

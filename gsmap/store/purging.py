@@ -21,8 +21,8 @@ from gsmap.errors import BusyError
 from gsmap.store import integrity, objects, sqlite
 from gsmap.store.branches import MapLocation
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.column_types import KINDS
 from gsmap.store.error_translation import translate_errors
+from gsmap.store.result_rows import delete_results_of
 from gsmap.store.revisions import holds_in_revision
 from gsmap.store.schema import (
     CHUNK_BOXES,
@@ -32,26 +32,24 @@ from gsmap.store.schema import (
     edges,
     exports,
     files,
-    graphs,
     groups,
-    index_segments,
     leases,
     lookups,
+    metadata,
     object_facts,
     observations,
     photo_sightings,
     poses,
-    prepared_scenes,
     priors,
     purges,
     registrations,
+    results,
     reviews,
     revisions,
     scene_facts,
     scenes,
     set_aside,
     tiles,
-    view_features,
 )
 from gsmap.store.store import Store
 
@@ -164,7 +162,7 @@ def finish(store: Store, purge: Purge, unreachable: Sequence[str]) -> Purge:
     copies = sorted({*pending.get("copies", ()), *there})
     for name in there:
         remove_file(store.folder, name)
-    for folder in (store.folder, *(store.arrays.root / kind for kind in KINDS), store.arrays.staging):
+    for folder in (store.folder, *(store.arrays.root / kind for kind in store.arrays.kinds()), store.arrays.staging):
         if is_folder(folder):
             sync_folder(folder)  # so that deletions survive a power cut
     left = {group for _, group in store.arrays.groups()}  # still named by a branch
@@ -261,20 +259,15 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
     ]
     drop("tiles", tiles, tiles.c.number.in_(made_with_it))
     _forget_lookups(connection, scene)
-    drop("graphs", graphs, graphs.c.scene == scene)
-    drop("view_features", view_features, view_features.c.scene == scene)
-    drop("prepared_scenes", prepared_scenes, prepared_scenes.c.scene == scene)
+    counts.update(delete_results_of(connection, scene))
     drop("photos", photo_sightings, photo_sightings.c.scene == scene)
     counts.update(objects.forget_scene(connection, scene))
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": row.number})
     drop("scenes", scenes, scenes.c.id == scene)
-    claimed = set(connection.execute(select(scenes.c.group_id)).scalars())
-    claimed |= set(connection.execute(select(graphs.c.group_id)).scalars())
-    claimed |= set(connection.execute(select(comparisons.c.group_id)).scalars())
-    claimed |= set(connection.execute(select(index_segments.c.group_id)).scalars())
-    claimed |= set(connection.execute(select(view_features.c.group_id)).scalars())
-    claimed |= set(connection.execute(select(prepared_scenes.c.group_id)).scalars())
-    claimed |= set(connection.execute(select(photo_sightings.c.group_id)).scalars())
+    claimed = set()
+    for table in metadata.tables.values():
+        if table is not files and "group_id" in table.c:
+            claimed |= set(connection.execute(select(table.c.group_id)).scalars())
     unclaimed = [group for group in connection.execute(select(groups.c.id)).scalars() if group not in claimed]
     sizes = select(files.c.group_id, func.sum(files.c.size_bytes)).where(files.c.group_id.in_(unclaimed))
     bodies = {group: int(size) for group, size in connection.execute(sizes.group_by(files.c.group_id))}
@@ -294,10 +287,7 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
 
 
 def _forget_lookups(connection: Connection, scene: str) -> None:
-    """Delete index segments with the scene, which are recomputed, and its lookups and candidates."""
-    parts = connection.execute(select(index_segments.c.number, index_segments.c.members)).all()
-    with_it = [part.number for part in parts if any(member[0] == scene for member in part.members)]
-    connection.execute(delete(index_segments).where(index_segments.c.number.in_(with_it)))
+    """Delete the lookups of the scene, and the scene among the candidates of others."""
     connection.execute(delete(lookups).where(lookups.c.scene == scene))
     for one in connection.execute(select(lookups.c.scene, lookups.c.candidates)).all():
         others = [candidate for candidate in one.candidates if candidate[0] != scene]
@@ -328,11 +318,11 @@ def _scrub(connection: Connection, scene: str, names: set[str]) -> None:
             if changed:
                 keys = [column == line[column.name] for column in table.primary_key.columns]
                 connection.execute(update(table).where(*keys).values(**changed))
-    for row in connection.execute(select(graphs.c.key, graphs.c.about)).all():
-        notes = _replace_scene(row.about["notes"], pattern)
-        if notes != row.about["notes"]:
+    for row in connection.execute(select(results.c.number, results.c.about)).all():
+        notes = _replace_scene(row.about.get("notes"), pattern)
+        if notes != row.about.get("notes"):
             about = {**row.about, "notes": notes}
-            connection.execute(update(graphs).where(graphs.c.key == row.key).values(about=about))
+            connection.execute(update(results).where(results.c.number == row.number).values(about=about))
 
 
 def _replace_scene(value: Any, pattern: re.Pattern[str]) -> Any:
@@ -395,13 +385,14 @@ def _linked_files(store: Store, connection: Connection, scene: str) -> int:
     with_it = (comparisons.c.older == scene) | (comparisons.c.newer == scene)
     of_scene = {
         "scenes": select(scenes.c.group_id).where(scenes.c.id == scene, scenes.c.group_id.is_not(None)),
-        "graphs": select(graphs.c.group_id).where(graphs.c.scene == scene),
         "changes": select(comparisons.c.group_id).where(with_it, comparisons.c.group_id.is_not(None)),
         "photos": select(photo_sightings.c.group_id).where(
             photo_sightings.c.scene == scene, photo_sightings.c.group_id.is_not(None)
         ),
     }
     ids = [(kind, group) for kind, query in of_scene.items() for group in connection.execute(query).scalars()]
+    derived = select(results.c.kind, results.c.group_id).where(results.c.scene == scene)
+    ids += [(row.kind, row.group_id) for row in connection.execute(derived) if row.group_id is not None]
     found = (files_below(store.arrays.root / kind / name) for kind, name in ids)
     return sum(entry.st_nlink > 1 for group in found for entry in group.values())
 

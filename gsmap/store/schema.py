@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from sqlalchemy import (
@@ -31,11 +32,10 @@ from gsmap.store.column_types import (
     PackedNumbers,
     PairText,
     RelativePathText,
+    SceneListText,
     is_box,
     is_candidate_list,
     is_direction,
-    is_graph,
-    is_member_list,
     is_number_dict,
     is_object,
     is_pose,
@@ -57,8 +57,8 @@ from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
 from gsmap.types.map_object import OBJECT_FACTS
 from gsmap.types.world import OBSERVATION_KINDS
 
-HEAD = "0013"  # the newest migration; numbered, so that versions can be compared without alembic
-FIRST = "0013"  # the schema of the first release; older ones are of development versions and cannot be migrated
+HEAD = "0014"  # the newest migration; numbered, so that versions can be compared without alembic
+FIRST = "0014"  # the schema of the first release; older ones are of development versions and cannot be migrated
 
 REVISION_COUNTS = (
     "num_scenes",
@@ -103,6 +103,23 @@ def _recipe() -> Column[str]:
     return Column("recipe", DigestText, ForeignKey("recipes.digest"))
 
 
+def result_columns(is_valid: Callable[[Any], bool]) -> list[Column[Any]]:
+    """Return the columns of results whose metadata meets a condition."""
+    return [
+        Column("number", Integer, primary_key=True),
+        Column("kind", ArrayKindText, nullable=False),  # also of its array group
+        Column("key", KeyText, nullable=False),  # RecipeKey.digest
+        _recipe(),
+        # The scene of a result of one scene, or the ids of several scenes.
+        Column("scene", DigestText, ForeignKey("scenes.id"), index=True),
+        Column("scenes", SceneListText),
+        Column("num_items", Integer, nullable=False),  # nodes, features, cells, objects
+        Column("about", JsonText(is_valid), nullable=False),
+        Column("group_id", DigestText, ForeignKey("groups.id")),  # null without arrays
+        Column("created_at", Text, nullable=False),
+    ]
+
+
 about = _table(
     "about",
     Column("id", DigestText, primary_key=True),  # of the map, random
@@ -114,7 +131,7 @@ about = _table(
 groups = _table(
     "groups",
     Column("id", DigestText, primary_key=True),  # digest of the content
-    Column("kind", ArrayKindText, nullable=False),  # `KINDS`
+    Column("kind", ArrayKindText, nullable=False),
     Column("created_at", Text, nullable=False),
 )
 files = _table(
@@ -182,16 +199,10 @@ recipes = _table(
     Column("created_at", Text, nullable=False),
 )
 
-graphs = _table(
-    "graphs",
-    Column("key", KeyText, primary_key=True),  # RecipeKey.digest
-    _recipe(),
-    _scene("scene", index=True),
-    Column("num_nodes", Integer, nullable=False),
-    Column("about", JsonText(is_graph), nullable=False),  # up, unit_m, notes, layers
-    Column("group_id", DigestText, ForeignKey("groups.id"), nullable=False),
-    Column("created_at", Text, nullable=False),
-)
+# Results that are computed from scenes, by kind, and recomputed if lost (`gsmap.store.results`): scene graphs, view
+# features, prepared scenes, segments of indexes, objects of components.
+results = _table("results", *result_columns(is_object))
+Index("ix_results_kind_key", results.c.kind, results.c.key)
 
 registrations = _table(
     "registrations",
@@ -228,50 +239,13 @@ reviews = _table(
     CheckConstraint("review in ('confirm', 'reject', 'withdraw')", name="review"),
 )
 
-# Inverted indexes and lookups of retrieval; recomputed if lost.
-index_segments = _table(
-    "index_segments",
-    Column("number", Integer, primary_key=True),
-    Column("key", KeyText, nullable=False),  # of the index recipe
-    # Each member: scene, key of its graph, upright, metric, coarseness.
-    Column("members", JsonText(is_member_list), nullable=False),
-    Column("num_nodes", Integer, nullable=False),
-    Column("group_id", DigestText, ForeignKey("groups.id"), nullable=False),
-    Column("created_at", Text, nullable=False),
-)
+# Candidates that the index of graphs found for each scene; recomputed if lost.
 lookups = _table(
     "lookups",
     _scene("scene", primary_key=True),
     Column("key", KeyText, nullable=False),  # RecipeKey.digest of the query recipe and the scene's graph
     Column("candidates", JsonText(is_candidate_list), nullable=False),  # best first; each: scene, score, votes
     Column("num_left", Integer),  # of these, candidates left when there were enough edges; null before the first run
-    Column("created_at", Text, nullable=False),
-)
-
-# Features of the views of a scene, for localizing photos; recomputed if lost.
-view_features = _table(
-    "view_features",
-    Column("key", KeyText, primary_key=True),  # RecipeKey.digest
-    _recipe(),
-    _scene("scene", index=True),
-    Column("num_views", Integer, nullable=False),
-    Column("num_features", Integer, nullable=False),
-    Column("group_id", DigestText, ForeignKey("groups.id"), nullable=False),
-    Column("created_at", Text, nullable=False),
-)
-
-# Surface cells and renders of a scene, for its registrations; recomputed if lost.
-prepared_scenes = _table(
-    "prepared_scenes",
-    Column("key", KeyText, primary_key=True),  # RecipeKey.digest
-    _recipe(),
-    _scene("scene", index=True),
-    Column("unit_m", Real, nullable=False),  # working metres per unit of the scene
-    Column("num_gaussians", Integer, nullable=False),
-    Column("num_cells", Integer, nullable=False),
-    Column("num_views", Integer, nullable=False),
-    Column("num_own", Integer, nullable=False),
-    Column("group_id", DigestText, ForeignKey("groups.id"), nullable=False),
     Column("created_at", Text, nullable=False),
 )
 
@@ -401,8 +375,7 @@ photo_sightings = _table(
     Column("removed_at", Text),
 )
 
-# Objects tracked over all scenes by number (`o12`), with their boxes in each scene and facts about them. Computed
-# object sets are recomputed if lost or stale.
+# Objects tracked over all scenes by number (`o12`), with their boxes in each scene and facts about them.
 objects = _table(
     "objects",
     Column("number", Integer, primary_key=True),
@@ -424,16 +397,6 @@ object_facts = _table(
     Column("created_at", Text, nullable=False),
     CheckConstraint("kind in ('name', 'label', 'note', 'same_as')", name="kind"),
 )
-object_sets = _table(
-    "object_sets",
-    Column("number", Integer, primary_key=True),
-    Column("key", KeyText, nullable=False, index=True),  # RecipeKey.digest
-    _recipe(),
-    Column("poses", JsonText(is_poses_by_scene), nullable=False),  # S_map_scene of its captures, as used for it
-    Column("value", JsonText(is_object), nullable=False),  # as of `gsmap.store.objects`
-    Column("created_at", Text, nullable=False),
-)
-
 models = _table(
     "models",
     Column("number", Integer, primary_key=True),

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import func, select
 
-from gsmap.store.schema import files, graphs, groups, models, scenes
+from gsmap.store.result_rows import GRAPHS
+from gsmap.store.schema import files, groups, models, scenes
 
 if TYPE_CHECKING:
     from gsmap.store.store import Store
@@ -49,7 +50,7 @@ def sizes(store: Store) -> list[Size]:
 
 def graph_sizes(store: Store) -> dict[str, int]:
     """Return the size in bytes of the arrays of all graphs of every scene, as written, by scene id."""
-    own = select(graphs.c.scene, graphs.c.group_id).distinct().subquery()
+    own = GRAPHS.select(GRAPHS.c.scene, GRAPHS.c.group_id).distinct().subquery()
     query = select(own.c.scene, func.sum(files.c.size_bytes)).join(files, files.c.group_id == own.c.group_id)
     with store.catalog.read() as connection:
         return {scene: int(num_bytes) for scene, num_bytes in connection.execute(query.group_by(own.c.scene))}

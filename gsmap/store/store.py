@@ -15,7 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sqlalchemy import insert, select
+from sqlalchemy import func, insert, select
 
 from gsmap.durable import sync_folder
 from gsmap.errors import ConfigError, CorruptError, NotFoundError, SchemaVersionError, StoreError
@@ -46,7 +46,6 @@ from gsmap.store.remote_map import RemoteMap
 from gsmap.store.revisions import Revisions
 from gsmap.store.scenes import Scenes
 from gsmap.store.world import WorldObservations
-from gsmap.store.written import time_written
 from gsmap.types.progress import Progress
 from gsmap.version import __version__
 
@@ -55,6 +54,11 @@ if TYPE_CHECKING:
     from gsmap.store.view_features import ViewFeatures
 
 _log = logging.getLogger("gsmap.store")
+_WRITTEN = (
+    *(schema.scenes.c.ingested_at, schema.scenes.c.removed_at, schema.scene_facts.c.created_at),
+    *(schema.registrations.c.created_at, schema.reviews.c.created_at, schema.revisions.c.created_at),
+    *(schema.comparisons.c.created_at, schema.exports.c.created_at),
+)
 
 
 class Store:
@@ -317,7 +321,9 @@ class Store:
 
     def time_written(self) -> str | None:
         """Return the time of the map's newest row, ISO 8601; None for an empty map."""
-        return time_written(self.catalog)
+        with self.catalog.read() as connection:
+            newest = [connection.execute(select(func.max(column))).scalar() for column in _WRITTEN]
+        return max((str(when) for when in newest if when), default=None)
 
     def upload_settings(self) -> None:
         """Upload ``settings.toml`` of a remote map; does nothing for a local map."""

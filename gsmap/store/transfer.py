@@ -18,13 +18,12 @@ from gsmap.store.array_groups import forget_derived, has_group, manifest, name, 
 from gsmap.store.arrays import StagedGroup, StoredFile, link_or_copy
 from gsmap.store.change_rows import named_groups
 from gsmap.store.chunk_boxes import get_boxes, put_boxes
-from gsmap.store.graphs import KIND as GRAPHS
 from gsmap.store.models import model_path
 from gsmap.store.photos import KIND as PHOTOS
+from gsmap.store.result_rows import GRAPHS
 from gsmap.store.scene_refs import unused_name
 from gsmap.store.scenes import KIND as SCENES
 from gsmap.store.schema import (
-    graphs,
     groups,
     models,
     observations,
@@ -33,6 +32,7 @@ from gsmap.store.schema import (
     purges,
     recipes,
     registrations,
+    results,
     reviews,
     scene_facts,
     scenes,
@@ -254,18 +254,31 @@ class Transfer:
 
     # --- results and reviews -----------------------------------------------------------------------------------------
 
-    def graphs(self) -> None:
-        """Copy scene graphs; if both maps have a graph with the same key, keep the graph of this map."""
-        here = {row.key: row.group_id for row in self.ours.execute(select(graphs.c.key, graphs.c.group_id))}
-        for row in self.theirs.execute(select(graphs).order_by(graphs.c.created_at)).all():
+    def results(self) -> None:
+        """Copy the results of single scenes; if both maps have one with the same key, keep that of this map.
+
+        Graphs are identified by their keys. Of other kinds a scene has one result, which holds for its stored
+        Gaussians: it is copied where this map has none, and only for the same Gaussians.
+        """
+        whose = self.ours.execute(select(results).where(results.c.scene.is_not(None))).all()
+        here = {(row.kind, row.key): row.group_id for row in whose}
+        has_one = {(row.kind, row.scene) for row in whose}
+        stored = {row.id: row.group_id for row in self.ours.execute(select(scenes.c.id, scenes.c.group_id))}
+        their_scenes = {row.id: row.group_id for row in self._rows}
+        theirs = select(results).where(results.c.scene.is_not(None)).order_by(results.c.created_at, results.c.number)
+        for row in self.theirs.execute(theirs).all():
             if row.scene not in self.wanted:
                 continue
-            if row.key not in here or row.group_id == here[row.key]:
-                self.transfer_group(GRAPHS, row.group_id)
-            if row.key not in here:
+            is_known = (row.kind, row.key) in here
+            is_other = (row.kind, row.scene) in has_one or stored[row.scene] != their_scenes[row.scene]
+            if not is_known and row.kind != GRAPHS.kind and is_other:
+                continue
+            if not is_known or row.group_id == here[row.kind, row.key]:
+                self.transfer_group(row.kind, row.group_id)
+            if not is_known:
                 self.recipe(row.recipe)
-                self.ours.execute(insert(graphs), dict(row._mapping))
-                self.counts["graphs"] += 1
+                self.ours.execute(insert(results), _content(row))
+                self.counts[row.kind] += 1
 
     def recipe(self, digest: str | None) -> None:
         """Copy the recipe that a row of the other map names."""
@@ -443,11 +456,15 @@ def _missing_groups(
 ) -> dict[tuple[str, str], tuple[StoredFile, ...]]:
     """Return manifests, by (kind, id), of groups that the scenes need and that are missing or damaged in this map."""
     named = [(SCENES, row.id, row.group_id) for row in theirs.execute(select(scenes.c.id, scenes.c.group_id))]
-    of_whole = graphs.join(scenes, scenes.c.id == graphs.c.scene)
-    kept = select(graphs.c.key, graphs.c.group_id).select_from(of_whole).where(scenes.c.thinned.is_(None))
-    known = {row.key: row.group_id for row in ours.execute(kept)}
-    made = theirs.execute(select(graphs.c.key, graphs.c.scene, graphs.c.group_id))
-    named += [(GRAPHS, row.scene, row.group_id) for row in made if known.get(row.key, row.group_id) == row.group_id]
+    of_whole = results.join(scenes, scenes.c.id == results.c.scene)
+    kept = select(results).select_from(of_whole).where(scenes.c.thinned.is_(None))
+    mine = ours.execute(kept).all()
+    known = {(row.kind, row.key): row.group_id for row in mine}
+    has_one = {(row.kind, row.scene) for row in mine if row.kind != GRAPHS.kind}
+    for row in theirs.execute(select(results).where(results.c.scene.is_not(None))):
+        group = known.get((row.kind, row.key))
+        if group == row.group_id or (group is None and (row.kind, row.scene) not in has_one):
+            named.append((row.kind, row.scene, row.group_id))
     named += named_groups(ours, theirs, only)
     kept = select(photo_sightings).where(photo_sightings.c.removed_at.is_(None))
     named += [(PHOTOS, row.scene, row.group_id) for row in theirs.execute(kept)]

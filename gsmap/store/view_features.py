@@ -5,6 +5,7 @@ Candidate views of a photo come from the index of views (`gsmap.store.indexes`).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,8 @@ from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
-from gsmap.store.derived_arrays import DerivedArrays
 from gsmap.store.layout import Shape
-from gsmap.store.schema import view_features
+from gsmap.store.results import DerivedArrays
 from gsmap.types import Cameras
 from gsmap.types.localization import SceneFeatures
 
@@ -37,7 +37,7 @@ class ViewFeatures(DerivedArrays):
     """The view features of a map, one set per scene."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
-        super().__init__(catalog, arrays, view_features, KIND, _ARRAYS, "the features of scene")
+        super().__init__(catalog, arrays, KIND, _ARRAYS, "the features of scene")
 
     def save(self, found: SceneFeatures, key: RecipeKey) -> None:
         """Store the features of a scene in place of all earlier features of that scene.
@@ -54,8 +54,7 @@ class ViewFeatures(DerivedArrays):
             "intrinsics": found.cameras.intrinsics_px,
             "sizes": found.cameras.sizes_px,
         }
-        columns = {"num_views": found.num_views, "num_features": found.num_features}
-        self.put(found.scene, key, arrays, columns)
+        self.put(found.scene, key, arrays, num_views=found.num_views, num_items=found.num_features)
 
     def load(self, scene: str, key: RecipeKey | str) -> SceneFeatures | None:
         """Load the features of a scene with this key; None without such features.
@@ -67,8 +66,8 @@ class ViewFeatures(DerivedArrays):
         return self.get(scene, key, _shapes, _features)
 
 
-def _shapes(row: Row[Any]) -> dict[str, Shape]:
-    V, N = row.num_views, row.num_features
+def _shapes(about: Mapping[str, int]) -> dict[str, Shape]:
+    V, N = about["num_views"], about["num_items"]
     return {
         "starts": (V + 1,),
         "points": (N, 3),
@@ -82,7 +81,7 @@ def _shapes(row: Row[Any]) -> dict[str, Shape]:
 
 def _features(row: Row[Any], arrays: dict[str, np.ndarray]) -> SceneFeatures:
     starts = arrays["starts"]
-    if starts[0] != 0 or starts[-1] != row.num_features or (np.diff(starts) < 0).any():
+    if starts[0] != 0 or starts[-1] != row.num_items or (np.diff(starts) < 0).any():
         raise InputError("its views do not partition its features", code="invalid_record")
     if not np.isfinite(arrays["points"]).all():
         raise InputError("a point holds NaN or infinity", code="not_finite")

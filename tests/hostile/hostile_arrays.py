@@ -318,17 +318,17 @@ def an_archive_whose_metadata_differs_from_its_digest(w: World) -> None:
 def a_graph_whose_row_says_otherwise(w: World) -> None:
     """Arrays of a terabyte by the row, of other types, of layers of other widths."""
     with w.sql() as connection:
-        (text,) = connection.execute("SELECT about FROM graphs").fetchone()
+        (text,) = connection.execute("SELECT about FROM results WHERE kind = 'graphs'").fetchone()
         about = json.loads(text)
         for how in about["arrays"].values():
             how["shape"] = [10**12 if n == 4 else n for n in how["shape"]]
-        connection.execute("UPDATE graphs SET about = ?", (json.dumps(about),))
+        connection.execute("UPDATE results SET about = ? WHERE kind = 'graphs'", (json.dumps(about),))
 
 
 @case(r"gsmap does not write", verbs=("look MAP",))
 def a_graph_of_types_that_there_are_none_of(w: World) -> None:
-    w.set('UPDATE graphs SET about = replace(about, \'"is": "f8"\', \'"is": "O"\')')
-    w.set('UPDATE graphs SET about = replace(about, \'"is":"f8"\', \'"is":"O"\')')
+    w.set('UPDATE results SET about = replace(about, \'"is": "f8"\', \'"is": "O"\')')
+    w.set('UPDATE results SET about = replace(about, \'"is":"f8"\', \'"is":"O"\')')
 
 
 @case(r"not valid text", verbs=("look MAP", "export MAP TILES --tile-size 0 --merge union"))

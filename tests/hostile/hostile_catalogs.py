@@ -73,7 +73,7 @@ def a_change_without_a_box(w: World) -> None:
 
 @case(ROWS)
 def a_graph_whose_arrays_lie_elsewhere(w: World) -> None:
-    w.set("UPDATE graphs SET group_id = '../../../home/photos'")
+    w.set("UPDATE results SET group_id = '../../../home/photos'")
 
 
 @case(ROWS)
@@ -165,7 +165,7 @@ def files_whose_names_steer_the_terminal(w: World) -> None:
 
 @case(ROWS)
 def json_that_is_none(w: World) -> None:
-    w.set("UPDATE graphs SET about = '{'")
+    w.set("UPDATE results SET about = '{'")
 
 
 @case(ROWS)
@@ -175,7 +175,7 @@ def json_that_is_too_deep(w: World) -> None:
 
 @case(ROWS)
 def json_of_another_shape(w: World) -> None:
-    w.set("UPDATE graphs SET about = '[1, 2]'")
+    w.set("UPDATE results SET about = '[1, 2]'")
     w.set("UPDATE scenes SET bounds = '\"wide\"'")
 
 
@@ -213,7 +213,7 @@ def a_map_without_an_id(w: World) -> None:
 def edges_and_poses_of_scenes_that_are_not_there(w: World) -> None:
     w.set("UPDATE registrations SET source = ?, pair = ?", "f" * 32, f"{w.id_of('a')}:{'f' * 32}")
     w.set("UPDATE poses SET scene = ? WHERE scene = ?", "e" * 32, w.id_of("b"))
-    w.set("UPDATE graphs SET scene = ?", "d" * 32)
+    w.set("UPDATE results SET scene = ?", "d" * 32)
 
 
 # --- tables ----------------------------------------------------------------------------------------------------------

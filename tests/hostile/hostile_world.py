@@ -165,7 +165,7 @@ class World:
     def group(self, kind: str = "scenes") -> Path:
         """A scene's or a graph's folder."""
         with self.sql() as connection:
-            table = "scenes" if kind == "scenes" else "graphs"
+            table = "scenes" if kind == "scenes" else "results WHERE kind = 'graphs'"
             found = connection.execute(f"SELECT group_id FROM {table}").fetchone()
         return self.map / "arrays" / kind / str(found[0])
 

@@ -231,7 +231,7 @@ def test_another_order_of_captures_gives_the_objects_of_that_order(site: Map, tm
         m.edit("july", captured_at="2020-01-01")
         updated = m.objects().objects
         with m.store.catalog.write() as connection:
-            connection.execute(delete(schema.object_sets))
+            connection.execute(delete(schema.results).where(schema.results.c.kind == "objects"))
         whole = {row.id: row for row in m.objects().objects}
         assert {row.id for row in updated} == set(whole)
         for row in updated:
@@ -318,7 +318,7 @@ def test_a_capture_that_comes_asks_only_what_was_not_asked(site: Map) -> None:
 def forget(m: Map) -> None:
     """What was computed, not the numbers."""
     with m.store.catalog.write() as connection:
-        connection.execute(delete(schema.object_sets))
+        connection.execute(delete(schema.results).where(schema.results.c.kind == "objects"))
 
 
 def test_a_number_stays_when_captures_are_described_otherwise(site: Map) -> None:

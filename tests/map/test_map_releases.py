@@ -41,7 +41,7 @@ def one_worker(monkeypatch: pytest.MonkeyPatch) -> None:
 def said_by(path: Path) -> dict[str, int]:
     """Rows by table, as the file has them."""
     with closing(connect(f"file:{path / sqlite.FILE}?mode=ro&immutable=1", uri=True)) as database:
-        tables = ("scenes", "graphs", "registrations", "revisions", "priors", "models", "exports", "tiles")
+        tables = ("scenes", "results", "registrations", "revisions", "priors", "models", "exports", "tiles")
         return {table: database.execute(f"SELECT count(*) FROM {table}").fetchone()[0] for table in tables}
 
 

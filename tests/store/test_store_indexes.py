@@ -123,7 +123,7 @@ def test_a_purged_scene_is_in_no_segment_and_no_lookup(store):
     (left,) = store.indexes.lookups([a, b])
     assert [one.scene for one in left.candidates] == [c]
     with store.catalog.read() as connection:
-        told = connection.execute(text("SELECT members FROM index_segments UNION ALL SELECT candidates FROM lookups"))
+        told = connection.execute(text("SELECT about FROM results UNION ALL SELECT candidates FROM lookups"))
         assert not any(b in row for row in told.scalars())
     assert store.check().ok
 
@@ -143,6 +143,6 @@ def test_a_damaged_segment_is_named_by_check(store):
 def test_members_that_gsmap_did_not_write_are_refused(store, told):
     store.indexes.save_segment(A, members(A), arrays(), ())
     with store.catalog.write() as connection:
-        connection.execute(text("UPDATE index_segments SET members = :m"), {"m": told})
+        connection.execute(text("UPDATE results SET about = :m"), {"m": f'{{"members":{told}}}'})
     with raises(CorruptError, code="catalog_invalid"):
         store.indexes.segments(A)

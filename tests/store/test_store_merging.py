@@ -507,7 +507,7 @@ def test_damaged_arrays_come_from_another_map(store, other, removed):
         a = add(one, 1)
         describe(one, a)
     graph = next(p.name for p in (store.home / "arrays" / "graphs").iterdir())
-    before, rows = bytes_of(store.home / "arrays"), [dump(store)[table] for table in ("files", "groups", "graphs")]
+    before, rows = bytes_of(store.home / "arrays"), [dump(store)[table] for table in ("files", "groups", "results")]
     damage(store, "scenes", a)
     damage(store, "graphs", graph)
     if removed:
@@ -524,7 +524,7 @@ def test_damaged_arrays_come_from_another_map(store, other, removed):
     assert store.check().ok
     assert bytes_of(store.home / "arrays") == before
     assert [s.id for s in store.scenes.list()] == [a]
-    assert [dump(store)[table] for table in ("files", "groups", "graphs")] == rows
+    assert [dump(store)[table] for table in ("files", "groups", "results")] == rows
     assert import_scene(store, other, a).num_bytes == 0
     assert len(store.scenes.gaussians(a)) == 60
 

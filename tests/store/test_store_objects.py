@@ -109,7 +109,7 @@ def test_words_are_kept_with_their_history(store, scenes):
     "value",
     [
         {},
-        {"scenes": [], "things": [], "objects": [], "metres": 1.0},
+        {"poses": {}, "things": [], "objects": [], "metres": 1.0},
         {"objects": [{"id": "o1"}]},
         {"objects": [{"sightings": [[9, "seen", 0, None, 1.0, -1]]}]},
         {"objects": [{"sightings": [[0, "gone", 0, None, 1.0, -1]]}]},
@@ -120,15 +120,15 @@ def test_words_are_kept_with_their_history(store, scenes):
 def test_a_strangers_objects_are_refused(store, scenes, value):
     keep_objects(store, {scenes[0]: A})
     with store.catalog.write() as connection:
-        whole = connection.execute(select(schema.object_sets.c.value)).scalar_one()
-        if "scenes" not in value and value:
+        whole = connection.execute(select(schema.results.c.about)).scalar_one()
+        if "poses" not in value and value:
             value = whole | {"objects": [whole["objects"][0] | value["objects"][0]]}
             if set(value["objects"][0]) == {"id"}:
                 value["objects"][0] = {"id": "o1"}
-        connection.execute(update(schema.object_sets).values(value=value))
+        connection.execute(update(schema.results).values(about=value))
     if value.get("objects") == whole["objects"]:
         return
-    with raises(CorruptError, code="catalog_invalid", match="object_sets"):
+    with raises(CorruptError, code="catalog_invalid", match="results"):
         store.objects.sets()
 
 

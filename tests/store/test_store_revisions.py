@@ -15,7 +15,7 @@ from gsmap.geometry.rotations import exp_so3
 from gsmap.store import Store, matrices
 from gsmap.store import registrations as module
 from gsmap.store.registrations import Registrations, _disagreement
-from gsmap.store.schema import edges, graphs, poses, registrations, reviews
+from gsmap.store.schema import edges, poses, registrations, results, reviews
 from gsmap.types import EdgeOutcome, PoseGraph, Registration, SceneGraph, ScenePose, Sim3
 
 NUM = 12
@@ -313,19 +313,9 @@ def test_a_revision_made_from_the_newest_writes_the_rows_of_one_that_is_compared
     assert rows[0] == rows[1]
 
 
-def test_brief_scenes_and_what_graphs_say_are_what_lists_have(store):
-    for scene in store.scenes.list():
-        up = None if scene.name == "s01" else np.array([0.0, 0.6, 0.8])
-        store.graphs.save(SceneGraph(scene.id, {}, up, 0.5), key("describe", scene.id))
+def test_brief_scenes_are_what_lists_have(store):
     store.scenes.edit("s02", captured_at="2026-05-31T14:00:00+02:00")
     store.scenes.remove("s03")
-    for _ in range(2):  # the second time from memory
-        said = store.graphs.frames()
-        listed = store.graphs.list()
-        assert [(g.key, g.scene, g.unit_m, g.up) for g in said] == [(g.key, g.scene, g.unit_m, g.up) for g in listed]
-        graph = SceneGraph(store.scenes.list()[0].id, {}, np.array([1.0, 0, 0]), 2.0)
-        store.graphs.save(graph, key("describe", graph.scene_id))  # in place of what was said
-    assert {g.unit_m for g in store.graphs.frames()} == {0.5, 2.0}
     names = ("id", "name", "scale_policy", "captured_at", "thinning")
     assert [[getattr(one, name) for name in names] for one in store.scenes.summaries()] == [
         [getattr(one, name) for name in names] for one in store.scenes.list()
@@ -335,10 +325,21 @@ def test_brief_scenes_and_what_graphs_say_are_what_lists_have(store):
     }
     some = [scene.id for scene in store.scenes.list()[2:4]]
     assert [scene.id for scene in store.scenes.list(among=some)] == some
+
+
+def test_graphs_are_listed_from_memory_until_they_are_replaced(store):
+    for scene in store.scenes.list():
+        up = None if scene.name == "s01" else np.array([0.0, 0.6, 0.8])
+        store.graphs.save(SceneGraph(scene.id, {}, up, 0.5), key("describe", scene.id))
+    first = store.graphs.list()
+    assert {(g.unit_m, g.up) for g in first} == {(0.5, None), (0.5, (0.0, 0.6, 0.8))}
+    graph = SceneGraph(first[0].scene, {}, np.array([1.0, 0, 0]), 2.0)
+    store.graphs.save(graph, key("describe", graph.scene_id))
+    assert {g.scene for g in store.graphs.list() if g.unit_m == 2.0} == {graph.scene_id}
     with store.catalog.write() as connection:
-        connection.execute(graphs.update().where(graphs.c.scene == some[0]).values(about={"up": [1, "x", 0]}))
-    with Store.open(store.folder, "r") as other, raises(CorruptError, code="catalog_invalid", match=r"graphs\.about"):
-        other.graphs.frames()
+        connection.execute(results.update().where(results.c.scene == first[1].scene).values(about={"up": [1, "x", 0]}))
+    with Store.open(store.folder, "r") as other, raises(CorruptError, code="catalog_invalid", match=r"results\.about"):
+        other.graphs.list()
 
 
 @pytest.mark.parametrize(
@@ -365,7 +366,7 @@ def test_what_disagrees_is_read_as_json_says_it(text, said):
 
 
 def test_of_pairs_and_graphs_what_is_new_is_read(store, monkeypatch):
-    """And of that what is asked for: neither evidence nor what graphs say beside their frames is made of its text."""
+    """And of that what is asked for: evidence is not parsed."""
     ids, read, parsed = sorted(scene.id for scene in store.scenes.list()), [], []
     for k, pair in enumerate(combinations(ids, 2)):
         evidence = {f"figure_{i}": i * 0.1 for i in range(12)} | {"disagreement": k * 0.01}
@@ -380,15 +381,15 @@ def test_of_pairs_and_graphs_what_is_new_is_read(store, monkeypatch):
     monkeypatch.setattr(module, "_add_summaries", lambda known, rows: read.append(len(rows)) or add(known, rows))
     monkeypatch.setattr(json, "loads", lambda text: parsed.append(len(text)) or loads(text))
     store.registrations.all_summaries()
-    said = store.graphs.frames()
     assert read == [len(ids) * (len(ids) - 1) // 2]
     assert max(parsed, default=0) < 60
+    said = store.graphs.list()
     assert {(one.unit_m, one.up) for one in said} == {(0.5, (0.0, 0.6, 0.8))}
     store.registrations.save(Registration(*ids[:2], "no_match"), key("register", *ids[:2], turn=1))
     parsed.clear()
     for _ in range(2):
         store.registrations.summaries()
-        store.graphs.frames()
+        store.graphs.list()
     assert (read[1:], parsed) == ([1, 0], [])
 
 

@@ -44,7 +44,8 @@ def _row(store: Store, name: str, repeat: int) -> None:
     scene = store.scenes.get(name)
     folders = [store.home / "arrays" / "scenes" / scene.id]
     with store.catalog.read() as connection:
-        newest = f"SELECT group_id FROM graphs WHERE scene = '{scene.id}' ORDER BY created_at DESC LIMIT 1"
+        of_scene = f"kind = 'graphs' AND scene = '{scene.id}'"
+        newest = f"SELECT group_id FROM results WHERE {of_scene} ORDER BY created_at DESC LIMIT 1"
         folders.append(store.home / "arrays" / "graphs" / connection.exec_driver_sql(newest).scalar_one())
     files = sum(path.is_file() for folder in folders for path in folder.rglob("*"))
     own, made = (sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) for folder in folders)

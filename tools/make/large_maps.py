@@ -43,7 +43,7 @@ from gsmap.store.catalog import now
 from gsmap.store.chunk_boxes import get_boxes, put_boxes
 from gsmap.store.graphs import Graphs
 from gsmap.store.indexes import Lookup
-from gsmap.store.schema import files, graphs, registrations, scene_facts, scenes
+from gsmap.store.schema import files, registrations, results, scene_facts, scenes
 from gsmap.types import Cameras, Gaussians, NodeLayer, Registration, SceneGraph, Segments, Sim3
 from gsmap.types.retrieval import Candidate
 from gsmap.types.segments import merged, to_merge
@@ -442,7 +442,7 @@ def _add_rows(one: Filled, count: int) -> None:
     with store.catalog.write() as connection:
         first = connection.execute(select(scenes)).one()
         boxes = get_boxes(connection, first.number)
-        graph = connection.execute(select(graphs)).one()
+        graph = connection.execute(select(results).where(results.c.kind == "graphs")).one()
         for k in range(1, count + 1):
             mine = hashlib.sha256(f"street {k}".encode()).hexdigest()[:32]
             row = dict(first._mapping) | {"id": mine, "number": first.number + k, "name": f"street-{k:05d}"}
@@ -456,9 +456,10 @@ def _add_rows(one: Filled, count: int) -> None:
         if said:
             connection.execute(insert(scene_facts), said)
         keys = one.keys(one.order)
-        about = [dict(graph._mapping) | {"key": keys[s].digest, "scene": s} for s in one.order[1:]]
+        content = {name: value for name, value in graph._mapping.items() if name != "number"}
+        about = [content | {"key": keys[s].digest, "scene": s} for s in one.order[1:]]
         if about:
-            connection.execute(insert(graphs), about)
+            connection.execute(insert(results), about)
         recipe = recipe_key(one.map.settings.register)
         digest = recipes.save_recipe(connection, recipe)
         rows = []

@@ -344,7 +344,7 @@ class _Update:
         if self.wanted.graphs is not None:
             ups = {scene: graph.up for scene, graph in self.wanted.graphs.items()}
         else:
-            ups = {one.scene: None if one.up is None else np.array(one.up) for one in self.store.graphs.frames()}
+            ups = {one.scene: None if one.up is None else np.array(one.up) for one in self.store.graphs.list()}
         turned = [self._poses[s].rotation @ one for s in self._poses if (one := ups.get(s)) is not None]
         total = np.sum(turned, axis=0) if turned else np.zeros(3)
         length = float(np.linalg.norm(total))

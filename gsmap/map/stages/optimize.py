@@ -169,7 +169,7 @@ def _is_same_visit(a: datetime | None, b: datetime | None, hours: float) -> bool
 
 def _ups(store: Store, living: Sequence[SceneSummary], settings: Settings) -> dict[str, np.ndarray]:
     """Return the up direction of each scene by its current graph or, without one, by its newest graph."""
-    said = store.graphs.frames()
+    said = store.graphs.list()
     times = Counter(graph.scene for graph in said)
     several = [scene for scene in living if times[scene.id] > 1]
     present = {key.digest for key in graph_keys(store, several, settings).values()} if several else set[str]()

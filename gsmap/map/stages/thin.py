@@ -75,7 +75,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
     doubtful = [s for s in dated if s.thinning is None and s.id not in sure and _when(s) < before]
     of_scenes, of_graphs = scene_sizes(store), graph_sizes(store)
     sizes = {scene: of_scenes.get(scene, 0) + of_graphs.get(scene, 0) for scene in living}
-    ups = {graph.scene: graph.up for graph in store.graphs.frames()}  # of the newest graph
+    ups = {graph.scene: graph.up for graph in store.graphs.list()}  # of the newest graph
     shares = _superseded(store, known, before, graph, settings, progress)
     why = reason("pose_unconfirmed", "its pose is not confirmed: gsmap list MAP scenes shows its status")
     rows = [_row(scene, sizes[scene.id], sizes[scene.id], 0.0, why) for scene in doubtful]

@@ -145,7 +145,8 @@ def read_state(file: Path, created_at: str = "") -> MapState:
         counts = {
             "scenes": "scenes WHERE removed_at IS NULL",
             "removed": "scenes WHERE removed_at IS NOT NULL",
-            **{name: name for name in ("groups", "graphs", "registrations", "revisions")},
+            "graphs": "results WHERE kind = 'graphs'",
+            **{name: name for name in ("groups", "registrations", "revisions")},
         }
         return MapState(
             map_id=str(_one(connection, "SELECT id FROM about")),

@@ -3,7 +3,7 @@
 import sqlalchemy as sa
 from alembic import op
 
-revision = "0013"
+revision = "0014"
 down_revision = None
 branch_labels = None
 depends_on = None
@@ -116,18 +116,6 @@ def upgrade() -> None:
         sqlite_strict=True,
     )
     op.create_table(
-        "index_segments",
-        sa.Column("number", sa.Integer(), nullable=False),
-        sa.Column("key", sa.Text(), nullable=False),
-        sa.Column("members", sa.Text(), nullable=False),
-        sa.Column("num_nodes", sa.Integer(), nullable=False),
-        sa.Column("group_id", sa.Text(), nullable=False),
-        sa.Column("created_at", sa.Text(), nullable=False),
-        sa.ForeignKeyConstraint(["group_id"], ["groups.id"], name=op.f("fk_index_segments_group_id_groups")),
-        sa.PrimaryKeyConstraint("number", name=op.f("pk_index_segments")),
-        sqlite_strict=True,
-    )
-    op.create_table(
         "object_facts",
         sa.Column("number", sa.Integer(), nullable=False),
         sa.Column("object", sa.Integer(), nullable=False),
@@ -141,19 +129,6 @@ def upgrade() -> None:
         sqlite_strict=True,
     )
     op.create_index(op.f("ix_object_facts_object"), "object_facts", ["object"], unique=False)
-    op.create_table(
-        "object_sets",
-        sa.Column("number", sa.Integer(), nullable=False),
-        sa.Column("key", sa.Text(), nullable=False),
-        sa.Column("recipe", sa.Text(), nullable=True),
-        sa.Column("poses", sa.Text(), nullable=False),
-        sa.Column("value", sa.Text(), nullable=False),
-        sa.Column("created_at", sa.Text(), nullable=False),
-        sa.ForeignKeyConstraint(["recipe"], ["recipes.digest"], name=op.f("fk_object_sets_recipe_recipes")),
-        sa.PrimaryKeyConstraint("number", name=op.f("pk_object_sets")),
-        sqlite_strict=True,
-    )
-    op.create_index(op.f("ix_object_sets_key"), "object_sets", ["key"], unique=False)
     op.create_table(
         "revisions",
         sa.Column("number", sa.Integer(), autoincrement=False, nullable=False),
@@ -263,21 +238,25 @@ def upgrade() -> None:
     )
     op.create_index(op.f("ix_exports_target"), "exports", ["target"], unique=False)
     op.create_table(
-        "graphs",
+        "results",
+        sa.Column("number", sa.Integer(), nullable=False),
+        sa.Column("kind", sa.Text(), nullable=False),
         sa.Column("key", sa.Text(), nullable=False),
         sa.Column("recipe", sa.Text(), nullable=True),
-        sa.Column("scene", sa.Text(), nullable=False),
-        sa.Column("num_nodes", sa.Integer(), nullable=False),
+        sa.Column("scene", sa.Text(), nullable=True),
+        sa.Column("scenes", sa.Text(), nullable=True),
+        sa.Column("num_items", sa.Integer(), nullable=False),
         sa.Column("about", sa.Text(), nullable=False),
-        sa.Column("group_id", sa.Text(), nullable=False),
+        sa.Column("group_id", sa.Text(), nullable=True),
         sa.Column("created_at", sa.Text(), nullable=False),
-        sa.ForeignKeyConstraint(["group_id"], ["groups.id"], name=op.f("fk_graphs_group_id_groups")),
-        sa.ForeignKeyConstraint(["recipe"], ["recipes.digest"], name=op.f("fk_graphs_recipe_recipes")),
-        sa.ForeignKeyConstraint(["scene"], ["scenes.id"], name=op.f("fk_graphs_scene_scenes")),
-        sa.PrimaryKeyConstraint("key", name=op.f("pk_graphs")),
+        sa.ForeignKeyConstraint(["group_id"], ["groups.id"], name=op.f("fk_results_group_id_groups")),
+        sa.ForeignKeyConstraint(["recipe"], ["recipes.digest"], name=op.f("fk_results_recipe_recipes")),
+        sa.ForeignKeyConstraint(["scene"], ["scenes.id"], name=op.f("fk_results_scene_scenes")),
+        sa.PrimaryKeyConstraint("number", name=op.f("pk_results")),
         sqlite_strict=True,
     )
-    op.create_index(op.f("ix_graphs_scene"), "graphs", ["scene"], unique=False)
+    op.create_index(op.f("ix_results_kind_key"), "results", ["kind", "key"], unique=False)
+    op.create_index(op.f("ix_results_scene"), "results", ["scene"], unique=False)
     op.create_table(
         "lookups",
         sa.Column("scene", sa.Text(), nullable=False),
@@ -352,25 +331,6 @@ def upgrade() -> None:
     )
     op.create_index(op.f("ix_poses_until"), "poses", ["until"], unique=False)
     op.create_table(
-        "prepared_scenes",
-        sa.Column("key", sa.Text(), nullable=False),
-        sa.Column("recipe", sa.Text(), nullable=True),
-        sa.Column("scene", sa.Text(), nullable=False),
-        sa.Column("unit_m", sa.Double().with_variant(sa.REAL(), "sqlite"), nullable=False),
-        sa.Column("num_gaussians", sa.Integer(), nullable=False),
-        sa.Column("num_cells", sa.Integer(), nullable=False),
-        sa.Column("num_views", sa.Integer(), nullable=False),
-        sa.Column("num_own", sa.Integer(), nullable=False),
-        sa.Column("group_id", sa.Text(), nullable=False),
-        sa.Column("created_at", sa.Text(), nullable=False),
-        sa.ForeignKeyConstraint(["group_id"], ["groups.id"], name=op.f("fk_prepared_scenes_group_id_groups")),
-        sa.ForeignKeyConstraint(["recipe"], ["recipes.digest"], name=op.f("fk_prepared_scenes_recipe_recipes")),
-        sa.ForeignKeyConstraint(["scene"], ["scenes.id"], name=op.f("fk_prepared_scenes_scene_scenes")),
-        sa.PrimaryKeyConstraint("key", name=op.f("pk_prepared_scenes")),
-        sqlite_strict=True,
-    )
-    op.create_index(op.f("ix_prepared_scenes_scene"), "prepared_scenes", ["scene"], unique=False)
-    op.create_table(
         "priors",
         sa.Column("number", sa.Integer(), nullable=False),
         sa.Column("scene", sa.Text(), nullable=False),
@@ -438,22 +398,6 @@ def upgrade() -> None:
         sqlite_strict=True,
     )
     op.create_index(op.f("ix_scene_facts_scene"), "scene_facts", ["scene"], unique=False)
-    op.create_table(
-        "view_features",
-        sa.Column("key", sa.Text(), nullable=False),
-        sa.Column("recipe", sa.Text(), nullable=True),
-        sa.Column("scene", sa.Text(), nullable=False),
-        sa.Column("num_views", sa.Integer(), nullable=False),
-        sa.Column("num_features", sa.Integer(), nullable=False),
-        sa.Column("group_id", sa.Text(), nullable=False),
-        sa.Column("created_at", sa.Text(), nullable=False),
-        sa.ForeignKeyConstraint(["group_id"], ["groups.id"], name=op.f("fk_view_features_group_id_groups")),
-        sa.ForeignKeyConstraint(["recipe"], ["recipes.digest"], name=op.f("fk_view_features_recipe_recipes")),
-        sa.ForeignKeyConstraint(["scene"], ["scenes.id"], name=op.f("fk_view_features_scene_scenes")),
-        sa.PrimaryKeyConstraint("key", name=op.f("pk_view_features")),
-        sqlite_strict=True,
-    )
-    op.create_index(op.f("ix_view_features_scene"), "view_features", ["scene"], unique=False)
     op.create_table(
         "changes",
         sa.Column("number", sa.Integer(), nullable=False),
@@ -555,25 +499,21 @@ def downgrade() -> None:
         "tiles",
         "reviews",
         "changes",
-        "view_features",
         "scene_facts",
         "registrations",
         "priors",
-        "prepared_scenes",
         "poses",
         "photo_sightings",
         "observations",
         "object_places",
         "lookups",
-        "graphs",
+        "results",
         "exports",
         "edges",
         "comparisons",
         "scenes",
         "revisions",
-        "object_sets",
         "object_facts",
-        "index_segments",
         "files",
         "set_aside",
         "recipes",

@@ -1,0 +1,114 @@
+"""A new kind of result, made in this file alone, is listed, kept, copied, checked, pruned and purged like any other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from raising import raises
+from store_samples import key, make_cameras, make_gaussians
+
+from gsmap.errors import CorruptError, InputError
+from gsmap.store import Store, merging, purging
+from gsmap.store.backup import restoring
+from gsmap.store.results import DerivedArrays
+from gsmap.store.sizes import sizes
+from gsmap.types import Scene
+
+
+class MeanColours(DerivedArrays):
+    """The mean colour of each scene."""
+
+    def __init__(self, store: Store) -> None:
+        types = {"mean": np.dtype(np.float64)}
+        super().__init__(store.catalog, store.arrays, "colours", types, "the mean colour of scene")
+
+    def save(self, scene: str, mean: np.ndarray) -> None:
+        self.put(scene, key("colours", scene), {"mean": mean[None]}, num_items=1)
+
+    def load(self, scene: str) -> np.ndarray | None:
+        return self.get(
+            scene,
+            key("colours", scene),
+            lambda about: {"mean": (about["num_items"], 3)},
+            lambda row, arrays: arrays["mean"][0],
+        )
+
+
+GREY = np.array([0.1, 0.2, 1 / 3])
+
+
+@pytest.fixture
+def scene(store: Store) -> Scene:
+    made = store.scenes.add(make_gaussians(), make_cameras(), name="a")[0]
+    MeanColours(store).save(made.id, GREY)
+    return made
+
+
+def groups(store: Store) -> list[str]:
+    return [name for kind, name in store.arrays.groups() if kind == "colours"]
+
+
+def test_it_is_read_as_it_was_saved_and_listed(store: Store, scene: Scene) -> None:
+    colours = MeanColours(store)
+    assert np.array_equal(colours.load(scene.id), GREY)
+    assert colours.stored_keys([key("colours", scene.id), "0" * 32]) == {key("colours", scene.id).digest}
+    assert {one.kind: one.count for one in sizes(store)}["colours"] == 1
+    assert store.view_features.stored_keys([key("colours", scene.id)]) == set()  # another kind
+    assert store.graphs.find(key("colours", scene.id)) is None
+    with raises(InputError, code="key_input_mismatch"):
+        colours.put(scene.id, key("colours"), {"mean": GREY[None]}, num_items=1)
+
+
+def test_a_clone_and_a_merge_carry_it(store: Store, scene: Scene, tmp_path: Path) -> None:
+    restoring.clone(store, tmp_path / "clone.gsmap")
+    with Store.open(tmp_path / "clone.gsmap", "r") as clone:
+        assert np.array_equal(MeanColours(clone).load(scene.id), GREY)
+    with Store.create(tmp_path / "other.gsmap") as other:
+        merging.merge(other, store)
+        assert np.array_equal(MeanColours(other).load(scene.id), GREY)
+        MeanColours(other).put(scene.id, key("colours", scene.id, bright=True), {"mean": GREY[None] + 1}, num_items=1)
+        merging.merge(other, store)  # a scene has one of a kind: the map keeps its own
+        assert MeanColours(other).load(scene.id) is None
+        assert other.check().ok
+
+
+def test_of_a_thinned_scene_it_is_forgotten_and_not_copied(store: Store, scene: Scene, tmp_path: Path) -> None:
+    with Store.create(tmp_path / "other.gsmap") as other:
+        other.scenes.add(make_gaussians(), make_cameras(), name="a")
+        store.scenes.thin("a", np.arange(scene.num_gaussians) < 100)
+        assert MeanColours(store).load(scene.id) is None
+        MeanColours(store).save(scene.id, GREY)  # of the Gaussians that are left
+        merging.merge(other, store)
+        assert MeanColours(other).load(scene.id) is None
+        MeanColours(other).save(scene.id, 2 * GREY)
+        merging.merge(store, other)  # the scene is whole again, and the result comes with it
+        assert np.array_equal(MeanColours(store).load(scene.id), 2 * GREY)
+
+
+def test_it_goes_with_its_scene(store: Store, scene: Scene) -> None:
+    store.scenes.remove("a")
+    assert store.prune().num_bytes > 0
+    assert groups(store) == []
+    assert store.check().ok
+
+
+def test_a_purge_counts_and_erases_it(store: Store, scene: Scene) -> None:
+    done = purging.finish(store, purging.begin(store, scene.id), ())
+    assert done.receipt["rows"]["colours"] == 1
+    assert groups(store) == []
+
+
+def test_damage_is_found_and_forgotten(store: Store, scene: Scene) -> None:
+    (name,) = groups(store)
+    file = store.folder / "arrays" / "colours" / name / "arrays.zip"
+    file.write_bytes(file.read_bytes()[:-50])
+    (problem,) = store.check().problems
+    assert "computes it again" in problem
+    with raises(CorruptError, code="arrays_missing"):
+        MeanColours(store).load(scene.id)
+    MeanColours(store).forget_damaged([scene.id])
+    assert MeanColours(store).load(scene.id) is None
+    store.prune()
+    assert store.check().ok
