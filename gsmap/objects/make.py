@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 
 import numpy as np
 
@@ -20,13 +20,14 @@ from gsmap.objects.component_scenes import (
     boxes_meet,
     no_match,
 )
+from gsmap.objects.outlines import Outline, measure_outlines
 from gsmap.objects.regroup import Group, regroup
 from gsmap.objects.visibility import LONGEST_SIDE_PX, MAX_VIEWS, RenderedViews, classify_observation, observe_points
 from gsmap.types import MapObject, ObjectObservation, ObservationState
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
-VERSION = 4
+VERSION = 5
 """Version, raised whenever the objects of the same scenes change, also through other modules of `gsmap.objects`."""
 
 _FLOOR_AND_CEILING = (0.01, 0.995)  # quantiles of the heights of a scene's segments
@@ -156,11 +157,24 @@ def update_objects(
         for scene in one.members:
             shown.setdefault(scene, []).append(i)
     asked = _pairs_to_observe(scenes, objects, changed)
-    for done, (scene, some) in enumerate(asked.items()):
-        progress(done / len(asked), f"observing {len(some)} objects in scene {done + 1} of {len(asked)}")
-        _observe(scenes, objects, shown, scene, some, before, set(told.parted), metres, render, in_frustum)
+    new = [_largest(scenes, one.members) for one in objects if one.earlier is None]
+    kinds = _known_kinds(scenes, new, earlier, changed - set(same))
+    to_measure: dict[str, list[SegmentRef]] = {}
+    for largest in new:
+        if largest not in kinds:
+            to_measure.setdefault(largest[0], []).append(largest)
     level = np.eye(3) if up is None else level_frame(up)
-    return _sorted([_finished(scenes, one, component, level, metres) for one in objects])
+    to_visit = [scene for scene in scenes.order if scene in asked or scene in to_measure]
+    for done, scene in enumerate(to_visit):
+        some = asked.get(scene, [])
+        progress(done / len(to_visit), f"observing {len(some)} objects in scene {done + 1} of {len(to_visit)}")
+        views = cache(partial(render, scenes.load(scene)))
+        if some:
+            _observe(scenes, objects, shown, scene, some, before, set(told.parted), metres, views, in_frustum)
+        outlines = _outlines(scenes, scene, metres, views) if scene in to_measure and scene in scenes.views else []
+        for segment in to_measure.get(scene, ()):
+            kinds[segment] = _is_building(scenes, segment, level, metres, outlines[segment[1]] if outlines else None)
+    return _sorted([_finished(scenes, one, component, kinds) for one in objects])
 
 
 def _strip(thing: MapObject, scenes: ComponentScenes, changed: Collection[str], same: Collection[str]) -> _Object:
@@ -229,7 +243,7 @@ def _observe(
     before: Mapping[tuple[str, str, int], ObjectObservation],
     parted: Collection[tuple[SegmentRef, str]],
     metres: float,
-    render: Callable[[SegmentedScene], RenderedViews],
+    views: Callable[[], RenderedViews],
     in_frustum: Callable[[SegmentedScene, np.ndarray], bool],
 ) -> None:
     """Observe objects in one scene, and add the observations to them.
@@ -253,7 +267,7 @@ def _observe(
         elif in_frustum(capture, S_scene_map.apply(scenes.samples(expected[i])[0])):
             to_observe.append(i)
     if to_observe:
-        seen = render(capture)
+        seen = views()
         # Estimate exposure from objects that the scene certainly shows or, without any, from all objects with a surface
         # in place.
         sure = shown.get(scene) or to_observe
@@ -276,7 +290,14 @@ def _observe(
         objects[i].observations[scene] = ObjectObservation(scene, state, -1, box, share, asked_of)
 
 
-def _finished(scenes: ComponentScenes, made: _Object, component: int, level: np.ndarray, metres: float) -> MapObject:
+def _outlines(scenes: ComponentScenes, scene: str, metres: float, views: Callable[[], RenderedViews]) -> list[Outline]:
+    """Return the outlines of a scene's segments; empty if no view shows segments."""
+    capture, seen = scenes.load(scene), views()
+    unit_m = metres * capture.S_map_scene.scale
+    return measure_outlines(seen, len(capture.segments), unit_m) if seen.segments else []
+
+
+def _finished(scenes: ComponentScenes, made: _Object, component: int, kinds: Mapping[SegmentRef, bool]) -> MapObject:
     """Return the object with its observations, oldest first."""
     observed = tuple(sorted(made.observations.values(), key=lambda one: scenes.rank[one.scene]))
     if made.earlier is not None:
@@ -295,17 +316,39 @@ def _finished(scenes: ComponentScenes, made: _Object, component: int, level: np.
         newest.S_map_scene.apply(newest.segments.positions[shown][None])[0],
         newest.segments.colours[shown],
         observed,
-        is_building=_is_building(scenes, segments, level, metres),
+        is_building=kinds[_largest(scenes, made.members)],
     )
 
 
-def _is_building(scenes: ComponentScenes, segments: Sequence[SegmentRef], level: np.ndarray, metres: float) -> bool:
+def _known_kinds(
+    scenes: ComponentScenes, segments: Sequence[SegmentRef], earlier: Sequence[MapObject], changed: Collection[str]
+) -> dict[SegmentRef, bool]:
+    """Return whether objects are parts of the building, by those of some segments that decided it for earlier
+    objects."""
+    wanted, out = set(segments), {}
+    for one in earlier:
+        members = _members(one, scenes, changed)
+        if wanted.isdisjoint(members.items()) or len(members) < sum(s.thing >= 0 for s in one.sightings):
+            continue
+        out[_largest(scenes, members)] = one.is_building
+    return out
+
+
+def _largest(scenes: ComponentScenes, members: Mapping[str, int]) -> SegmentRef:
+    """Return the segment with most samples of an object; the oldest of several."""
+    oldest_first = sorted(members.items(), key=lambda one: scenes.rank[one[0]])
+    return max(oldest_first, key=lambda one: scenes.load(one[0]).segments.sample_counts[one[1]])
+
+
+def _is_building(
+    scenes: ComponentScenes, largest: SegmentRef, level: np.ndarray, metres: float, outline: Outline | None
+) -> bool:
     """Return true if an object is a part of the building, by its segment with most samples."""
-    scene, segment = max(segments, key=lambda one: scenes.load(one[0]).segments.sample_counts[one[1]])
-    capture = scenes.load(scene)
+    capture = scenes.load(largest[0])
     heights = capture.points @ level[2] * metres
-    points, lab = scenes.samples((scene, segment))
-    return is_building_part(points @ level.T * metres, lab, *np.quantile(heights, _FLOOR_AND_CEILING).tolist())
+    points, lab = scenes.samples(largest)
+    floor_m, ceiling_m = np.quantile(heights, _FLOOR_AND_CEILING).tolist()
+    return is_building_part(points @ level.T * metres, lab, floor_m, ceiling_m, outline)
 
 
 def _sorted(objects: list[MapObject]) -> list[MapObject]:

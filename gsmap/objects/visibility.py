@@ -30,11 +30,13 @@ class RenderedViews:
         cameras: one camera of each render.
         depths: (H, W) float32 of each render, 0 without a surface.
         colours: (H, W, 3) float32 of each render, L*a*b*.
+        segments: (H, W) int32 segment at each pixel of each render, -1 for none; empty if they are unknown.
     """
 
     cameras: tuple[Cameras, ...]
     depths: tuple[np.ndarray, ...]
     colours: tuple[np.ndarray, ...]
+    segments: tuple[np.ndarray, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,18 +59,30 @@ def render_views(
     cameras: Cameras | None,
     max_views: int = MAX_VIEWS,
     longest_side_px: int = LONGEST_SIDE_PX,
+    members: np.ndarray | None = None,
 ) -> RenderedViews:
-    """Render a scene from its own cameras; the result has no views if cameras are missing or synthesized."""
+    """Render a scene from its own cameras; the result has no views if cameras are missing or synthesized.
+
+    Args:
+        members: (N,) segment of each Gaussian, -1 for none; default: unknown.
+    """
     if cameras is None or not len(cameras) or cameras.synthesised:
         return RenderedViews((), (), ())
     small = cameras.evenly(max_views).resized(longest_side_px)
     views = tuple(small[i] for i in range(len(small)))
-    seen = [render(gaussians, view, dominant_id=False) for view in views]
+    seen = [render(gaussians, view, dominant_id=members is not None) for view in views]
     return RenderedViews(
         views,
         tuple(np.where(image.alpha[0] > 0.5, image.depth[0], 0) for image in seen),
         tuple(srgb_to_lab(np.clip(np.nan_to_num(image.colour[0]), 0, 1)) for image in seen),
+        () if members is None else tuple(_labels(image.dominant_id[0], members) for image in seen),
     )
+
+
+def _labels(ids: np.ndarray, members: np.ndarray) -> np.ndarray:
+    """Return the segment of each pixel from its dominant Gaussian."""
+    out: np.ndarray = np.where(ids >= 0, members[ids], -1)
+    return out
 
 
 def is_in_view(cameras: Cameras | None, points: np.ndarray, max_views: int = MAX_VIEWS) -> bool:

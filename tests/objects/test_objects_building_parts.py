@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gsmap.objects.building_parts import CELL_M, is_building_part
+from gsmap.objects.outlines import Outline
 
 WOOD, WALL = np.array([45.0, 15, 25]), np.array([80.0, 0, 3])
 
@@ -34,10 +35,10 @@ def coloured(points, *colours) -> np.ndarray:
     return np.array(colours)[np.random.default_rng(0).integers(0, len(colours), len(points))]
 
 
-def is_part(points, *colours, turn_deg=30.0) -> bool:
+def is_part(points, *colours, turn_deg=30.0, outline=None) -> bool:
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     turned = points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    return is_building_part(turned, coloured(points, *colours), 0.0, 2.5)
+    return is_building_part(turned, coloured(points, *colours), 0.0, 2.5, outline)
 
 
 @pytest.mark.parametrize(
@@ -79,3 +80,20 @@ def test_a_picture_is_an_object_and_a_patch_of_the_wall_is_not():
 )
 def test_rooms_corners_trims_and_debris_are_none(name, points):
     assert is_part(points, WALL, WOOD)
+
+
+@pytest.mark.parametrize(
+    ("outline", "solid", "flat"),
+    [
+        (Outline(60, 30, 10, 0, 0, 900), False, False),
+        (Outline(10, 20, 70, 0, 0, 900), True, True),  # the surface continues
+        (Outline(10, 70, 20, 0, 0, 900), True, False),  # hangs on a wall, or lies in one
+        (Outline(5, 50, 0, 45, 0, 900), True, True),  # behind the surface around it
+        (Outline(20, 10, 10, 0, 60, 900), False, False),  # behind other objects
+        (Outline(2, 2, 9, 0, 0, 900), False, False),  # too short to judge
+        (Outline(60, 30, 10, 0, 0, 12), True, True),  # nearly invisible
+    ],
+)
+def test_what_is_cut_out_of_a_surface_is_a_part_of_the_building(outline, solid, flat):
+    assert is_part(block((0, 0, 0), (2.2, 0.9, 0.8)), WOOD, outline=outline) == solid
+    assert is_part(sheet((0, 0, 1.2), (0.8, 0, 0), (0, 0, 0.6)), WOOD, WALL, outline=outline) == flat

@@ -6,6 +6,8 @@
 Each PLACE is a folder that tools/make/change.py wrote; poses are the true ones. Of every capture:
 
 pieces    furniture (and pictures) of at least 60 Gaussians that one thing covers with an IoU of more than a half.
+listed    of these, those whose object is listed as one, and not as a part of the building.
+building  listed objects most of which is building.
 
 Of the first two captures, of pieces that both show:
 
@@ -62,7 +64,7 @@ def main() -> None:
 def score(truth: Truth, with_changes: bool) -> Counter[str]:
     """Counts by what is scored; ``X`` of ``X of``."""
     counts: Counter[str] = Counter()
-    captures, whose = [], []
+    captures, whose, found = [], [], []
     for when in truth.times:
         gaussians = formats.read(truth.folder / f"{when}.ply")
         cameras = formats.read_cameras(truth.folder / f"{when}.cameras.json")
@@ -76,16 +78,18 @@ def score(truth: Truth, with_changes: bool) -> Counter[str]:
         counts["captures"] += 1
         captures.append(SegmentedScene(when, truth.T_place_scene(when), things))
         whose.append(owners(truth, when, truth.gaussians(when).means))
-        _pieces(counts, truth.states(when), things, whose[-1])
+        found.append(_pieces(counts, truth.states(when), things, whose[-1]))
 
     def eyes(capture: SegmentedScene) -> RenderedViews:
         gaussians = formats.read(truth.folder / f"{capture.scene}.ply")
-        return render_views(gaussians, formats.read_cameras(truth.folder / f"{capture.scene}.cameras.json"))
+        cameras = formats.read_cameras(truth.folder / f"{capture.scene}.cameras.json")
+        return render_views(gaussians, cameras, members=capture.segments.members)
 
     moved, parted = _told(truth, captures) if with_changes else ([], [])
     told = MatchedSegments(moved, parted)
     objects, took = timed(make_objects, captures, 0, eyes, match=lambda scenes: told)
     counts["objects ms"] += round(1000 * took)
+    _listed(counts, truth, captures, whose, found, objects)
     _followed(counts, truth, captures, whose, objects)
     return counts
 
@@ -108,7 +112,9 @@ def _told(truth: Truth, captures: list[SegmentedScene]) -> tuple[list[Any], list
     return moved, parted
 
 
-def _pieces(counts: Counter[str], states: list[dict[str, Any]], things: Segments, owner: np.ndarray) -> None:
+def _pieces(counts: Counter[str], states: list[dict[str, Any]], things: Segments, owner: np.ndarray) -> dict[int, str]:
+    """Count the pieces, and return the kind of piece that each thing covers."""
+    covered = {}
     for state in states:
         mine = owner == state["id"]
         if state["kind"] not in _KINDS or mine.sum() < _SHOWN:
@@ -116,8 +122,36 @@ def _pieces(counts: Counter[str], states: list[dict[str, Any]], things: Segments
         found = things.members[mine & (things.members >= 0)]
         shared = np.bincount(found, minlength=len(things))
         union = np.bincount(things.members[things.members >= 0], minlength=len(things)) + mine.sum() - shared
+        overlap = shared / np.maximum(union, 1)
+        is_found = bool(overlap.max(initial=0) > 0.5)
+        if is_found:
+            covered[int(np.argmax(overlap))] = _KINDS[state["kind"]]
         counts[f"pieces: {_KINDS[state['kind']]} of"] += 1
-        counts[f"pieces: {_KINDS[state['kind']]}"] += int((shared / np.maximum(union, 1)).max(initial=0) > 0.5)
+        counts[f"pieces: {_KINDS[state['kind']]}"] += is_found
+    return covered
+
+
+def _listed(
+    counts: Counter[str],
+    truth: Truth,
+    captures: list[SegmentedScene],
+    whose: list[np.ndarray],
+    found: list[dict[int, str]],
+    objects: list[MapObject],
+) -> None:
+    at = {one.scene: i for i, one in enumerate(captures)}
+    kinds = [{state["id"]: state["kind"] for state in truth.states(one.scene)} for one in captures]
+    for thing in objects:
+        shown = [(at[s.scene], s.thing) for s in thing.sightings if s.thing >= 0]
+        for i, segment in shown:
+            if segment in found[i]:
+                counts[f"listed: {found[i][segment]} of"] += 1
+                counts[f"listed: {found[i][segment]}"] += not thing.is_building
+        i, segment = max(shown, key=lambda one: captures[one[0]].segments.sample_counts[one[1]])
+        piece = _of(captures[i], whose[i], segment)
+        if not thing.is_building:
+            counts["building of"] += 1
+            counts["building"] += kinds[i].get(piece) in ("shell", "window", "door", None)
 
 
 def _followed(

@@ -270,7 +270,9 @@ class _Update:
 
     def _render(self, capture: SegmentedScene) -> RenderedViews:
         params, gaussians = self.settings.objects, self.store.scenes.gaussians(capture.scene)
-        return render_views(gaussians, self._cameras_of(capture.scene), params.max_views, params.longest_side_px)
+        segments, cameras = self._segments_of(capture.scene), self._cameras_of(capture.scene)
+        members = None if segments is None else segments.members
+        return render_views(gaussians, cameras, params.max_views, params.longest_side_px, members)
 
     def _view_box(self, scene: str) -> np.ndarray | None:
         """Return a box (2, 3) around what a scene's cameras can observe; None if it is not searched for objects.
