@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,9 +13,9 @@ from gsmap.map.objects import MapObjects
 from gsmap.store import Store
 from gsmap.types import ObjectObservation
 from gsmap.view.change_picture import draw_place
-from gsmap.view.object_picture import SegmentedViews
+from gsmap.view.object_picture import BestView, SegmentedViews
 
-_MOST_SCENES = 64  # of 3 MB of labels each
+_MAX_SCENES = 4  # number of scenes, those with most samples of an object, among which that of its picture is chosen
 
 
 class ObjectPictures:
@@ -25,9 +23,10 @@ class ObjectPictures:
 
     def __init__(self, store: Store, known: MapObjects) -> None:
         self._store, self._known = store, known
+        self._graph = store.revisions.get()
         self._lock = threading.Lock()
         self._counts: dict[str, np.ndarray] = {}  # samples of each segment of a scene
-        self._shown: OrderedDict[str, Sequence[np.ndarray]] = OrderedDict()  # of the scenes drawn last
+        self._best: dict[str, list[BestView | None]] = {}  # best view of each segment of a scene
         self._read: tuple[str, SegmentedViews] | None = None
 
     def draw(self, ref: str, side_px: int = 400) -> np.ndarray:
@@ -36,7 +35,7 @@ class ObjectPictures:
         Raises:
             NotFoundError: no such object, or no placed scene shows it.
         """
-        thing, graph = self._known.named(ref), self._store.revisions.get()
+        thing, graph = self._known.named(ref), self._graph
         shown = [
             one
             for one in thing.sightings
@@ -45,27 +44,40 @@ class ObjectPictures:
             and one.scene in self._known.scenes
             and one.scene in graph.poses
         ]
-        if not shown or graph is None:
+        if not shown:
             raise NotFoundError(f"no scene shows {ref}", code="object_not_shown")
+        metres = self._known.metres[thing.component]
         with self._lock:
-            best = max(shown, key=self._num_samples)
+            shown = sorted(shown, key=self._num_samples, reverse=True)[:_MAX_SCENES]
+            views = [(self._best_view(one, metres), one) for one in shown]
+            # A scene with more samples shows more of the object.
+            view, best = max(
+                views, key=lambda pair: 0.0 if pair[0] is None else pair[0].score * self._num_samples(pair[1])
+            )
+            scene = self._views(best.scene, metres)
+            if view is not None:
+                return scene.draw(best.thing, view, side_px)
             assert best.box is not None
-            metres = self._known.metres[thing.component]
-            if self._read is None or self._read[0] != best.scene:
-                S = in_metres(graph.poses[best.scene].S_map_scene, metres)
-                posed, stored = posed_scene(self._store, best.scene, S), self._store.graphs.load(best.scene)
-                segments = None if stored is None else stored.segments
-                members = np.full(len(posed.gaussians), -1) if segments is None else segments.members
-                self._read = best.scene, SegmentedViews(posed, members, self._shown.get(best.scene))
-            views = self._read[1]
-            drawn = None
-            if best.thing >= 0 and views.scene.cameras is not None:
-                drawn = views.draw(best.thing, side_px)
-                self._shown[best.scene] = views.shown
-                self._shown.move_to_end(best.scene)
-                while len(self._shown) > _MOST_SCENES:
-                    self._shown.popitem(last=False)
-            return draw_place(views.scene, best.box * metres, side_px) if drawn is None else drawn
+            return draw_place(scene.scene, best.box * metres, side_px)
+
+    def _best_view(self, sighting: ObjectObservation, metres: float) -> BestView | None:
+        """Return the view that shows a scene's own segment of an object best; None without one."""
+        if sighting.thing < 0:
+            return None
+        if sighting.scene not in self._best:
+            self._best[sighting.scene] = self._views(sighting.scene, metres).best_views()
+        views = self._best[sighting.scene]
+        return views[sighting.thing] if sighting.thing < len(views) else None
+
+    def _views(self, scene: str, metres: float) -> SegmentedViews:
+        if self._read is None or self._read[0] != scene:
+            assert self._graph is not None
+            S = in_metres(self._graph.poses[scene].S_map_scene, metres)
+            posed, stored = posed_scene(self._store, scene, S), self._store.graphs.load(scene)
+            segments = None if stored is None else stored.segments
+            members = np.full(len(posed.gaussians), -1) if segments is None else segments.members
+            self._read = scene, SegmentedViews(posed, members)
+        return self._read[1]
 
     def _num_samples(self, sighting: ObjectObservation) -> int:
         """Return the number of samples of a scene's own segment of an object; 0 without one."""
@@ -73,7 +85,7 @@ class ObjectPictures:
             return 0
         if sighting.scene not in self._counts:
             graph = self._store.graphs.load(sighting.scene)
-            things = None if graph is None else graph.segments
-            self._counts[sighting.scene] = np.zeros(0, int) if things is None else things.sample_counts
+            segments = None if graph is None else graph.segments
+            self._counts[sighting.scene] = np.zeros(0, int) if segments is None else segments.sample_counts
         counts = self._counts[sighting.scene]
         return int(counts[sighting.thing]) if sighting.thing < len(counts) else 0

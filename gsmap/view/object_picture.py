@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,12 +18,30 @@ _POINTS = 300  # maximum number of an object's Gaussians that are projected
 _LARGE = 0.06  # fraction of a view from which on an object is large enough
 _BORDER = 0.03  # width of the border of a view, relative to its sides, in which an object may be cut off
 _MIN_PIXELS = 6  # smallest number of pixels of a view that show an object
-_MARGIN = 0.45  # margin around an object, as a fraction of its size
+_STRAYS = 0.03  # fraction of an object's points beyond each side of its box in a view
+_MARGIN = 0.4  # margin around an object, as a fraction of its size
 _MIN_CROP = 0.3  # smallest crop as a fraction of the view, so that small objects have context
+_BEYOND = 0.1  # a crop may reach so far beyond a view, relative to its sides: Gaussians are there, too
 _ASPECT = 4 / 3
 _FADED = 0.55  # fraction of grey in what is around the object
+_BACKGROUND = 0.7  # grey where no Gaussian is
 _MIN_PART = 0.1  # smallest part of an object that is outlined, relative to its largest part
 _OUTLINE = (235, 64, 52)
+
+
+class BestView(NamedTuple):
+    """The view of a scene that shows a segment best.
+
+    Args:
+        score: product of the fractions of the segment within the view (to the fourth power) and visible, and of the
+            square roots of its size relative to a large one, and of its visible area relative to that in other views.
+        camera: index of the camera among the scene's cameras.
+        box: left, top, right and bottom around the segment, as fractions of the view's sides.
+    """
+
+    score: float
+    camera: int
+    box: tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,87 +51,103 @@ class SegmentedViews:
     Args:
         scene: the scene, with cameras.
         members: (N,) segment of each Gaussian; -1 for none.
-        known: `shown` of the same scene, if it was computed before.
     """
 
     scene: PosedScene
     members: np.ndarray
-    known: Sequence[np.ndarray] | None = None
-
-    @cached_property
-    def _cameras(self) -> Cameras:
-        cameras = self.scene.cameras
-        assert cameras is not None
-        return cameras[np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), _MAX_VIEWS)).astype(int))]
 
     @cached_property
     def _index(self) -> ChunkIndex:
         return ChunkIndex.build(self.scene.gaussians)
 
-    @cached_property
-    def shown(self) -> Sequence[np.ndarray]:
-        """Per view the (H, W) segment at each pixel of a small picture; -1 for none."""
-        cameras = self._cameras.resized(_VIEW_PX)
-        return self.known or [self._segments(cameras[view])[1] for view in range(len(cameras))]
+    def best_views(self) -> list[BestView | None]:
+        """Find the view that shows each segment best: unhidden, whole and large; None for a segment without any."""
+        cameras, count = self.scene.cameras, int(self.members.max(initial=-1)) + 1
+        if cameras is None or not len(cameras) or not count:
+            return [None] * count
+        points, of = self._sampled(count)
+        chosen = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), _MAX_VIEWS)).astype(int))
+        small = cameras.resized(_VIEW_PX)
+        scores, areas = np.stack([self._scores(small[int(view)], points, of, count) for view in chosen], axis=1)
+        scores *= np.sqrt(areas / np.maximum(areas.max(0), 1e-12))
+        out: list[BestView | None] = []
+        for segment, view in enumerate(np.argmax(scores, axis=0)):
+            camera, score = int(chosen[view]), float(scores[view, segment])
+            box = _box_in(small[camera], points[of == segment])
+            out.append(BestView(score, camera, box) if score > 0 else None)
+        return out
 
-    def draw(self, segment: int, side_px: int) -> np.ndarray | None:
-        """Draw a segment, outlined in a picture (H, W, 3) uint8; None if no view shows it.
+    def draw(self, segment: int, view: BestView, side_px: int) -> np.ndarray:
+        """Draw a segment in a view, outlined in a picture (H, W, 3) uint8.
 
         Args:
             side_px: longer side of the picture.
         """
-        found = self._best_view(segment)
-        if found is None:
-            return None
-        camera = _cropped(self._cameras[found], self.shown[found] == segment, side_px)
-        colour, shown = self._segments(camera)
+        assert self.scene.cameras is not None
+        colour, shown, _ = self._segments(_cropped(self.scene.cameras[view.camera], view.box, side_px))
         return _outlined(colour, shown == segment)
 
-    def _best_view(self, segment: int) -> int | None:
-        """Return the view that shows most of a segment, unhidden, whole and large enough; None without any."""
-        points = self.scene.gaussians.means[self.members == segment]
-        if not len(points):
-            return None
-        points = points[:: -(-len(points) // _POINTS)].astype(np.float64)
-        scores = [self._score(view, segment, points) for view in range(len(self._cameras))]
-        best = int(np.argmax([0.0, *scores])) - 1
-        return best if best >= 0 else None
+    def _sampled(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return Gaussians (K, 3) of all segments, a limited number of each, and their segments (K,)."""
+        rows = np.flatnonzero(self.members >= 0)
+        rows = rows[np.argsort(self.members[rows], kind="stable")]
+        sizes = np.bincount(self.members[rows], minlength=count)
+        rank = np.arange(len(rows)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+        rows = rows[rank % np.repeat(-(-sizes // _POINTS), sizes) == 0]
+        return self.scene.gaussians.means[rows].astype(np.float64), self.members[rows]
 
-    def _score(self, view: int, segment: int, points: np.ndarray) -> float:
-        shown = self.shown[view] == segment
-        count = int(shown.sum())
-        if count < _MIN_PIXELS:
-            return 0.0
-        camera = self._cameras[view].resized(_VIEW_PX)
+    def _scores(self, camera: Cameras, points: np.ndarray, of: np.ndarray, count: int) -> np.ndarray:
+        """Return the (2, M) score of each segment in a small view, and the area of its surface, across the line of
+        sight."""
+        _, shown, far = self._segments(camera)
         pixels, depth = project(points, camera.T_camera_frame[0], camera.intrinsics_px[0])
-        there = in_image(pixels, depth, camera.sizes_px[0])
         size = camera.sizes_px[0]
-        whole = there & (np.minimum(pixels, size - pixels) > _BORDER * size).all(1)
-        # Pixels of the views on which the points lie, widened by one, as the points are sparse.
-        covered = np.zeros(shown.shape, dtype=bool)
-        column, row = pixels[there].astype(int).T
-        covered[row, column] = True
-        visible = (_widened(shown) & covered).sum() / max(int(covered.sum()), 1)
-        return float(whole.mean() ** 2 * visible * min(1.0, count / (_LARGE * shown.size)) ** 0.5)
+        there = np.flatnonzero(in_image(pixels, depth, size))
+        pixels, mine = pixels[there], of[there]
+        is_whole = (np.minimum(pixels, size - pixels) > _BORDER * size).all(1)
+        whole = np.bincount(mine[is_whole], minlength=count) / np.maximum(np.bincount(of, minlength=count), 1)
+        # Pixels on which the points lie, widened by one, as the points are sparse.
+        column, row = pixels.astype(int).T
+        _, first = np.unique(np.stack([mine, row, column]), axis=1, return_index=True)
+        mine, row, column = mine[first], row[first], column[first]
+        padded = np.pad(shown, 1, constant_values=-1)
+        beside = [padded[row + down, column + right] == mine for down in range(3) for right in range(3)]
+        visible = np.bincount(mine[np.any(beside, axis=0)], minlength=count) / np.maximum(
+            np.bincount(mine, minlength=count), 1
+        )
+        pixel_counts = np.bincount(shown[shown >= 0], minlength=count)
+        large = np.minimum(1.0, pixel_counts / (_LARGE * shown.size)) ** 0.5
+        area = np.bincount(shown[shown >= 0], far[shown >= 0] ** 2, count)
+        return np.stack([np.where(pixel_counts >= _MIN_PIXELS, whole**4 * visible * large, 0.0), area])
 
-    def _segments(self, camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
-        """Render one camera: colours (H, W, 3) and the segment (H, W) at each pixel, -1 for none."""
-        seen = render(self.scene.gaussians, camera, depth=False, index=self._index)
-        ids = seen.dominant_id[0]
-        return seen.colour[0], np.where(ids >= 0, self.members[ids], -1)
+    def _segments(self, camera: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Render one camera: colours (H, W, 3), and the segment (H, W), -1 for none, and depth (H, W) of each pixel."""
+        seen = render(self.scene.gaussians, camera, index=self._index)
+        ids, alpha = seen.dominant_id[0], seen.alpha[0]
+        colour = seen.colour[0] + _BACKGROUND * np.maximum(1 - 2 * alpha, 0)[..., None]
+        return colour, np.where(ids >= 0, self.members[ids], -1), np.nan_to_num(seen.depth[0])
 
 
-def _cropped(camera: Cameras, shown: np.ndarray, side_px: int) -> Cameras:
-    """Return the camera cropped around the pixels (h, w) of a small view that show an object, and resized."""
-    width, height = camera.sizes_px[0].tolist()
-    rows, columns = np.nonzero(shown)
-    scale = width / shown.shape[1]
-    low = np.array([np.quantile(columns, 0.02), np.quantile(rows, 0.02)]) * scale
-    high = (np.array([np.quantile(columns, 0.98), np.quantile(rows, 0.98)]) + 1) * scale
+def _box_in(camera: Cameras, points: np.ndarray) -> tuple[float, float, float, float]:
+    """Return left, top, right and bottom around most of some points in a view, as fractions of its sides."""
+    pixels, depth = project(points, camera.T_camera_frame[0], camera.intrinsics_px[0])
+    pixels = pixels[depth > 0] / camera.sizes_px[0]
+    if not len(pixels):
+        return 0.0, 0.0, 1.0, 1.0
+    low, high = np.quantile(pixels, [_STRAYS, 1 - _STRAYS], axis=0).tolist()
+    return low[0], low[1], high[0], high[1]
+
+
+def _cropped(camera: Cameras, box: tuple[float, float, float, float], side_px: int) -> Cameras:
+    """Return the camera cropped around a box (fractions of the view's sides) with margins, and resized."""
+    size = camera.sizes_px[0].astype(np.float64)
+    width, height = size
+    low, high = np.clip(np.array(box).reshape(2, 2), -_BEYOND, 1 + _BEYOND) * size
     wide, tall = np.maximum((high - low) * (1 + 2 * _MARGIN), _MIN_CROP * width)
-    wide = min(max(wide, tall * _ASPECT), width, height * _ASPECT)
-    size = np.array([wide, wide / _ASPECT])
-    corner = np.clip((low + high - size) / 2, 0, np.array([width, height]) - size)
+    wide = min(max(wide, tall * _ASPECT), max(width, height * _ASPECT))
+    crop = np.array([wide, wide / _ASPECT])
+    most = np.maximum((1 + _BEYOND) * size - crop, -_BEYOND * size)
+    corner = np.clip((low + high - crop) / 2, -_BEYOND * size, most)
     intrinsics = camera.intrinsics_px * side_px / wide - np.array([0, 0, *(corner * side_px / wide)])
     return Cameras(camera.T_frame_camera, intrinsics, np.array([[side_px, round(side_px / _ASPECT)]]), camera.names)
 

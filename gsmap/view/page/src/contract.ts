@@ -5,7 +5,6 @@
 // same `state`.
 
 export type Vector = [number, number, number];
-export type Vector4 = [number, number, number, number];
 export type Matrix = number[][]; // 4 x 4, [s R | t]
 export type Box = [Vector, Vector]; // lowest and highest corner
 
@@ -138,7 +137,7 @@ export interface ChangeEntry {
   confidence: number;
   status: string; // "open", "confirmed", "rejected"
   note: string; // of the review
-  pictures: [string, string] | null; // GET: before and after, from the same camera
+  pictures: string | null; // GET: one picture, before and after beside each other
 }
 
 export interface PhotoEntry {
@@ -154,7 +153,6 @@ export interface PhotoEntry {
 export interface FloorPlan {
   picture: string | null; // a data address
   size_m: [number, number];
-  P_plan_map: [Vector4, Vector4]; // times (x, y, z, 1) of a point of the map: its position on the plan
   scenes: { scene: number; at: [number, number]; outlines: [number, number][][] }[]; // index into MapSummary.scenes
 }
 
@@ -209,7 +207,6 @@ export interface GraphEntry {
   objects: ObjectEntry[];
   relations: { a: string; b: string; kind: string }[]; // ids; kind: "on", "in", "next to"
   rooms: RoomEntry[];
-  changes: Record<string, string>; // room of each change that lies in one; ids
 }
 
 /** GET of MapSummary.history */

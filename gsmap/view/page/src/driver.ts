@@ -121,10 +121,9 @@ export function drive(stage: Stage): () => void {
         stage.setGraph(known.value);
       }
     }
-    changes.now(derive.shownChanges(state));
+    changes.now(state.tab === "time" || state.selection?.kind === "change" ? derive.listedChanges(state) : []);
     detail.now(detailOf(state));
-    const { selection } = state;
-    const chosen = selection?.kind === "object" || selection?.kind === "change" ? selection.key : null;
+    const chosen = state.selection?.kind === "object" ? state.selection.key : null;
     highlighted.now(new Set([chosen, state.hovered].flatMap((id) => id ?? [])));
     measured.now((state.ruler ?? [state.pick]).flatMap((pick) => (pick?.point ? [pick.point] : [])));
     ruler.now(state.ruler !== null);

@@ -17,7 +17,6 @@ import "./help";
 import "./labels";
 import "./look";
 import "./notices";
-import "./pair";
 import "./place";
 import "./progress";
 import "./review";

@@ -84,7 +84,7 @@ class View3D implements Stage {
   private isCeilingShown = true;
   private gizmos: { handle: Object3D; controls: TransformControls[] } | null = null;
   private readonly shownOverlays = new Set<Overlay>();
-  private graph: GraphEntry = { objects: [], relations: [], rooms: [], changes: {} };
+  private graph: GraphEntry = { objects: [], relations: [], rooms: [] };
   private highlighted: ReadonlySet<string> = new Set();
   private measured: readonly Vector[] = [];
   private isRulerTaken = false;
@@ -194,8 +194,8 @@ class View3D implements Stage {
     this.drawOverlays();
   }
 
-  setHighlighted(things: ReadonlySet<string>): void {
-    this.highlighted = things;
+  setHighlighted(objects: ReadonlySet<string>): void {
+    this.highlighted = objects;
     this.drawOverlays();
   }
 
@@ -667,15 +667,16 @@ class View3D implements Stage {
         : [],
       2,
     );
-    const boxes = (isBold: boolean) =>
+    overlays.set(
+      "changes",
       this.changes.flatMap((change) => {
-        if (!isHere(change.component) || this.highlighted.has(change.id) !== isBold) return [];
+        if (!isHere(change.component)) return [];
         const index = map.changes.findIndex((one) => one.id === change.id);
         const thing = { kind: "change" as const, index };
         return [{ points: boxLines(change.box), colour: CHANGE_COLOURS[change.kind], thing }];
-      });
-    overlays.set("changes", boxes(false), 2);
-    overlays.set("highlighted changes", boxes(true), 5);
+      }),
+      2.5,
+    );
     overlays.set(
       "correspondences",
       this.detail
