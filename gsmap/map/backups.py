@@ -1,4 +1,4 @@
-"""Back up, restore and clone a map, and report the results as rows."""
+"""Back up and restore a map, and report the results as rows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsmap.store import Store, schema
 from gsmap.store import backup as _backup
 from gsmap.store.storage import open_storage
 from gsmap.types.progress import Progress, silent
-from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
+from gsmap.types.rows.backups import BackupReport, RestoreReport, SnapshotRow
 
 
 def save(
@@ -62,19 +62,6 @@ def restore(
         snapshot=snapshot_row(made.snapshot),
         catalog_schema=made.schema,
         needs_migration=made.schema < schema.HEAD,
-    )
-
-
-def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silent) -> CloneReport:
-    """Clone a map (``gsmap clone MAP NEW``); see `gsmap.store.backup.clone`."""
-    made = _backup.clone(store, path, progress)
-    return CloneReport(
-        path=str(path),
-        map_id=made.map_id,
-        source_map_id=store.id,
-        num_linked=made.num_linked,
-        num_copied=made.num_copied,
-        num_bytes_copied=made.num_bytes_copied,
     )
 
 

@@ -1312,22 +1312,15 @@ class Map(AbstractContextManager["Map"]):
         """Make a branch (``gsmap branch MAP NAME``), a second catalog for the same arrays; `open` it as
         ``MAP@NAME``.
         """
-        from gsmap.map.map_operations import branch_row
-
-        return branch_row(self.store.branches.make(name))
+        return self.store.branches.make(name)
 
     def tag(self, name: str) -> BranchRow:
         """Make a tag (``gsmap tag MAP NAME``), the current state as read-only; `open` it as ``MAP@NAME``."""
-        from gsmap.map.map_operations import branch_row
-
-        return branch_row(self.store.branches.make(name, tag=True))
+        return self.store.branches.make(name, tag=True)
 
     def branches(self, kind: str | None = None) -> Table[BranchRow]:
         """List the branches and tags, or only one kind (``branch`` or ``tag``)."""
-        from gsmap.map.map_operations import branch_row
-
-        rows = [branch_row(branch) for branch in self.store.branches.list()]
-        return Table(row for row in rows if kind in (None, row.kind))
+        return Table(row for row in self.store.branches.list() if kind in (None, row.kind))
 
     def delete_branch(self, name: str, kind: str | None = None) -> BranchRow:
         """Delete a branch or tag (``gsmap branch MAP NAME --delete``); `prune` reclaims its data.
@@ -1335,9 +1328,7 @@ class Map(AbstractContextManager["Map"]):
         Raises:
             NotFoundError: none of that kind is called so.
         """
-        from gsmap.map.map_operations import branch_row
-
-        row = branch_row(self.store.branches.get(name))
+        row = self.store.branches.get(name)
         if kind not in (None, row.kind):
             raise NotFoundError(
                 f"{name} is a {row.kind}: gsmap {row.kind} {self.store.home} {name} --delete",
@@ -1394,12 +1385,12 @@ class Map(AbstractContextManager["Map"]):
 
     def check(self) -> CheckReport:
         """Check every byte of the map against its digest."""
-        return reports.check_report(self.store.check(lambda f, text: self._progress("check", f, text)))
+        return self.store.check(lambda f, text: self._progress("check", f, text))
 
     def prune(self, keep_revisions: int | None = None, *, dry_run: bool = False) -> PruneReport:
         """Delete leftovers of interrupted work and results older than the newest ``keep_revisions`` (None: all)
         revisions."""
-        return reports.prune_report(self.store.prune(keep_revisions=keep_revisions, dry_run=dry_run), dry_run)
+        return self.store.prune(keep_revisions=keep_revisions, dry_run=dry_run)
 
     def thin(
         self,
@@ -1441,9 +1432,9 @@ class Map(AbstractContextManager["Map"]):
 
     def clone(self, path: str | os.PathLike[str]) -> CloneReport:
         """Make an independent copy of the map with its own id (``gsmap clone MAP NEW``)."""
-        from gsmap.map import backups
+        from gsmap.store import backup
 
-        return backups.clone(self.store, path, lambda f, text: self._progress("clone", f, text))
+        return backup.clone(self.store, path, lambda f, text: self._progress("clone", f, text))
 
     def add_model(self, kind: str, path: str | os.PathLike[str], *, preset: str = "clip", copy: bool = True) -> None:
         """Check an ONNX model, and copy it to the map (or reference it) for every later describe."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,55 +15,16 @@ from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.geometry.boxes import box_corners
 from gsmap.settings import FILE_NAME
 from gsmap.store import Store, merging, staging
-from gsmap.store.branches import Branch
 from gsmap.store.error_translation import translate_errors
 from gsmap.store.purging import Purge
 from gsmap.types import Scene
-from gsmap.types.rows.map_operations import BranchRow, MergeReport, PurgeReport, SplitReport
-
-
-def branch_row(branch: Branch) -> BranchRow:
-    """Return a branch or tag as a row."""
-    return BranchRow(
-        name=branch.name,
-        kind="tag" if branch.is_tag else "branch",
-        map=branch.location,
-        parent=branch.parent,
-        created_at=branch.created_at,
-        revision=branch.revision,
-        num_scenes=branch.num_scenes,
-        num_bytes=branch.num_bytes,
-    )
+from gsmap.types.rows.map_operations import MergeReport, PurgeReport, SplitReport
 
 
 def merge(store: Store, source: str | os.PathLike[str]) -> MergeReport:
     """Merge all data of another map into this map; see `gsmap.store.merging.merge`."""
     with Store.open(source, "r") as other:
-        merged = merging.merge(store, other)
-    return MergeReport(
-        map=store.location,
-        from_map=os.fspath(source),
-        num_scenes=merged.scenes,
-        num_removed=merged.removed,
-        num_known=merged.known,
-        num_graphs=merged.graphs,
-        num_registrations=merged.registrations,
-        num_reviews=merged.reviews,
-        num_facts=merged.facts,
-        num_priors=merged.priors,
-        num_observations=merged.observations,
-        num_photos=merged.photos,
-        num_models=merged.models,
-        num_comparisons=merged.comparisons,
-        num_change_reviews=merged.change_reviews,
-        num_objects=merged.objects,
-        num_object_facts=merged.object_facts,
-        num_revisions=merged.revisions,
-        renamed=dict(merged.renamed),
-        revision=merged.revision,
-        num_bytes=merged.num_bytes,
-        notes=merged.notes,
-    )
+        return replace(merging.merge(store, other), from_map=os.fspath(source))
 
 
 def split(store: Store, out: str | os.PathLike[str], chosen: Sequence[str]) -> SplitReport:
@@ -82,8 +44,8 @@ def split(store: Store, out: str | os.PathLike[str], chosen: Sequence[str]) -> S
         map=os.fspath(out),
         from_map=store.location,
         scene_names=names,
-        num_graphs=merged.graphs,
-        num_registrations=merged.registrations,
+        num_graphs=merged.num_graphs,
+        num_registrations=merged.num_registrations,
         revision=merged.revision,
         num_bytes=merged.num_bytes,
         notes=merged.notes,

@@ -4,7 +4,6 @@ from gsmap.store.arrays import digest
 from gsmap.store.exports import Export
 from gsmap.store.facts import Fact
 from gsmap.store.graphs import StoredGraph
-from gsmap.store.integrity import CheckResult, PruneResult
 from gsmap.store.models import Model
 from gsmap.store.registrations import MANUAL, Review, StoredRegistration
 from gsmap.store.revisions import Revision
@@ -13,10 +12,8 @@ from gsmap.store.store import Store
 
 __all__ = [
     "MANUAL",
-    "CheckResult",
     "Export",
     "Model",
-    "PruneResult",
     "Review",
     "Revision",
     "Fact",

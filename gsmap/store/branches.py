@@ -16,6 +16,7 @@ import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sqlalchemy import Connection, func, select
 
@@ -29,6 +30,9 @@ from gsmap.store.catalog_copy import copy_catalog, empty_catalog, make_independe
 from gsmap.store.error_translation import displayed_as, translate_errors
 from gsmap.store.remote_map import RemoteMap
 from gsmap.store.schema import exports, files, groups, leases, models, revisions, scenes, set_aside, tiles
+
+if TYPE_CHECKING:
+    from gsmap.types.rows.map_operations import BranchRow
 
 FOLDER = "branches"
 MARKER = "branch.json"
@@ -61,31 +65,6 @@ class MapLocation:
         if self.remote is not None:
             return self.remote.url
         return f"{self.home}@{self.branch}" if self.branch else str(self.home)
-
-
-@dataclass(frozen=True)
-class Branch:
-    """A branch or a tag.
-
-    Args:
-        name: unique among branches and tags of the map.
-        is_tag: read-only.
-        location: string that opens it.
-        parent: location of the map or branch that it was made from.
-        created_at: when it was made.
-        revision: number of its newest revision; None before the first.
-        num_scenes: number of living scenes.
-        num_bytes: size of its folder, without the shared arrays.
-    """
-
-    name: str
-    is_tag: bool
-    location: str
-    parent: str
-    created_at: str
-    revision: int | None
-    num_scenes: int
-    num_bytes: int
 
 
 def locate(path: str | os.PathLike[str]) -> MapLocation:
@@ -184,7 +163,7 @@ class Branches:
         self._catalog = catalog
         self._arrays = arrays
 
-    def make(self, name: str, *, tag: bool = False) -> Branch:
+    def make(self, name: str, *, tag: bool = False) -> BranchRow:
         """Make a branch by copying the catalog and settings, but no arrays; after an error, no partial branch remains.
 
         The branch is a separate map for exports and merging: it has its own id, its revisions name the map that solved
@@ -239,7 +218,7 @@ class Branches:
                 shutil.rmtree(staged, ignore_errors=True)
         return self.get(name)
 
-    def get(self, name: str) -> Branch:
+    def get(self, name: str) -> BranchRow:
         """Return a branch or tag by name.
 
         Raises:
@@ -247,7 +226,7 @@ class Branches:
         """
         return _branch(self._named(name))
 
-    def list(self) -> list[Branch]:
+    def list(self) -> list[BranchRow]:
         """Return all branches and tags, by name."""
         return [_branch(place) for place in branch_locations(self._place.home)]
 
@@ -379,7 +358,7 @@ def _read_marker(folder: Path) -> dict[str, str]:
         return {"kind": "tag", "parent": "", "created_at": ""}  # damaged: treat it as read-only
 
 
-def _branch(place: MapLocation) -> Branch:
+def _branch(place: MapLocation) -> BranchRow:
     marker = _read_marker(place.folder)
     revision, num_scenes = None, 0
     try:
@@ -391,4 +370,15 @@ def _branch(place: MapLocation) -> Branch:
         _log.warning("%s", error)
     parent = replace(place, branch=marker["parent"]).location
     size = sum(path.stat().st_size for path in place.folder.iterdir() if path.is_file())
-    return Branch(place.branch, place.is_tag, place.location, parent, marker["created_at"], revision, num_scenes, size)
+    from gsmap.types.rows.map_operations import BranchRow  # few maps have branches
+
+    return BranchRow(
+        name=place.branch,
+        kind="tag" if place.is_tag else "branch",
+        map=place.location,
+        parent=parent,
+        created_at=marker["created_at"],
+        revision=revision,
+        num_scenes=num_scenes,
+        num_bytes=size,
+    )

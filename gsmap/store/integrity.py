@@ -44,55 +44,12 @@ from gsmap.store.schema import (
     scenes,
 )
 from gsmap.types.progress import Progress
+from gsmap.types.rows.maps import CheckReport, PruneReport
 
 _WORTH_BYTES = 64 << 10
 _WORTH_SHARE = 0.05  # of the file: smaller free space is kept for new rows
 _log = logging.getLogger("gsmap.store")
 _RECLAIM_LATER = "files that could not be reclaimed remain until the next gsmap prune"
-
-
-@dataclass(frozen=True)
-class CheckResult:
-    """Result of `check`.
-
-    Args:
-        problems: one line each; empty for a sound map.
-        orphans: harmless groups without a row, left by a crash; `prune` removes them.
-        num_groups, num_bytes: amount read.
-        unverified: parts that cannot be verified, with the reason.
-    """
-
-    problems: tuple[str, ...]
-    orphans: tuple[str, ...]
-    num_groups: int
-    num_bytes: int
-    unverified: tuple[str, ...] = ()
-
-    @property
-    def ok(self) -> bool:
-        return not self.problems
-
-
-@dataclass(frozen=True)
-class PruneResult:
-    """The data that `prune` reclaimed, or would reclaim.
-
-    Args:
-        scenes: names of removed scenes whose arrays were deleted.
-        revisions: numbers of revisions that can no longer be exported.
-        num_graphs, num_orphans, num_models: numbers of deleted graphs, groups without a row, and model copies.
-        num_bytes: bytes on disk of all of these, of replaced graphs, of leftovers of killed writers, and by which the
-            catalog file shrank (not in a dry run).
-        dry_run: nothing was changed.
-    """
-
-    scenes: tuple[str, ...] = ()
-    revisions: tuple[int, ...] = ()
-    num_graphs: int = 0
-    num_orphans: int = 0
-    num_models: int = 0
-    num_bytes: int = 0
-    dry_run: bool = False
 
 
 def check(
@@ -102,7 +59,7 @@ def check(
     *,
     read: set[tuple[str, tuple[StoredFile, ...]]] | None = None,
     location: str | None = None,
-) -> CheckResult:
+) -> CheckReport:
     """Read every byte of the map and compare it with its digests.
 
     Args:
@@ -151,10 +108,17 @@ def check(
     num_bytes = sum(f.size_bytes for group in unread for f in manifests[group])
     if progress:
         progress(1.0, "checked")
-    return CheckResult(tuple(problems), orphans, len(unread), num_bytes, unverified)
+    return CheckReport(
+        ok=not problems,
+        problems=tuple(problems),
+        orphans=orphans,
+        num_groups=len(unread),
+        num_bytes=num_bytes,
+        unverified=unverified,
+    )
 
 
-def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None, dry_run: bool = False) -> PruneResult:
+def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None, dry_run: bool = False) -> PruneReport:
     """Reclaim arrays and graphs of removed scenes that no kept revision uses, and leftovers of crashes.
 
     What another branch or tag of the map names stays.
@@ -178,7 +142,7 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
         raise DiskFullError(str(error).replace(PRUNE_MAY, "")) from error
 
 
-def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run: bool) -> PruneResult:
+def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run: bool) -> PruneReport:
     others = verify_catalogs(catalog, arrays)  # before any change
     with contextlib.nullcontext() if dry_run else catalog.lock():
         with catalog.read() as connection:
@@ -199,8 +163,8 @@ def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run
             # The rows are deleted: a crash from here on leaves orphans for the next prune of any branch.
             num_bytes += _reclaim(catalog, arrays, others).num_bytes
             num_bytes += _give_back(catalog)
-    return PruneResult(
-        scenes=tuple(name for name, _ in garbage.scenes),
+    return PruneReport(
+        scene_names=tuple(name for name, _ in garbage.scenes),
         revisions=tuple(garbage.revisions),
         num_graphs=garbage.num_graphs,
         num_orphans=len(set(orphans.groups) - set(garbage.groups)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -20,49 +20,12 @@ from gsmap.store.store import Store
 from gsmap.store.transfer import Transfer, open_transfer
 from gsmap.store.transfer_changes import transfer_comparisons
 from gsmap.store.transfer_objects import transfer_objects
+from gsmap.types.rows.map_operations import MergeReport
 
 Identity = tuple[str, int, str | None]
 
 
-@dataclass(frozen=True)
-class MergeResult:
-    """Result of a merge.
-
-    Args:
-        scenes, removed, known: numbers of new living scenes, of scenes new or now removed, and of scenes that both maps
-            had.
-        graphs, registrations, reviews, facts, priors, observations, photos, models, recipes, revisions, comparisons,
-            change_reviews, objects, object_facts: numbers of new rows.
-        renamed: (old, new) names of scenes whose name was in use.
-        revision: number of the joint revision; None if none was needed.
-        num_bytes: size of the new arrays, linked or copied.
-        notes: remarks for the user.
-    """
-
-    scenes: int = 0
-    removed: int = 0
-    known: int = 0
-    graphs: int = 0
-    registrations: int = 0
-    reviews: int = 0
-    facts: int = 0
-    priors: int = 0
-    observations: int = 0
-    photos: int = 0
-    models: int = 0
-    recipes: int = 0
-    revisions: int = 0
-    comparisons: int = 0
-    change_reviews: int = 0
-    objects: int = 0
-    object_facts: int = 0
-    renamed: tuple[tuple[str, str], ...] = ()
-    revision: int | None = None
-    num_bytes: int = 0
-    notes: tuple[str, ...] = field(default=())
-
-
-def merge(into: Store, source: Store) -> MergeResult:
+def merge(into: Store, source: Store) -> MergeReport:
     """Merge another map into this map without computing anything; a repeated merge adds nothing.
 
     Scenes with equal content are the same scene. Revisions are copied as history (`revisions.origin` names the map that
@@ -85,10 +48,10 @@ def merge(into: Store, source: Store) -> MergeResult:
         transfer.models()
         number = _revisions(transfer)
         transfer.notes += _compare_settings(into, source)
-        return _merged(transfer, number)
+        return _report(transfer, number)
 
 
-def split(source: Store, out: Store, chosen: Collection[str]) -> MergeResult:
+def split(source: Store, out: Store, chosen: Collection[str]) -> MergeReport:
     """Copy some scenes of a map to a new and empty map, with all data about these scenes and their pairs.
 
     The newest poses are copied, restricted to these scenes, as revision 1.
@@ -114,10 +77,10 @@ def split(source: Store, out: Store, chosen: Collection[str]) -> MergeResult:
             map_id, its_number, part = _identity(row, _id(transfer.theirs))
             origin = {"map": map_id, "number": its_number, "part": part or _id(transfer.ours)}
             transfer.ours.execute(revisions.update().where(revisions.c.number == number).values(origin=origin))
-        return _merged(transfer, number)
+        return _report(transfer, number)
 
 
-def import_scene(into: Store, source: Store, scene: str) -> MergeResult:
+def import_scene(into: Store, source: Store, scene: str) -> MergeReport:
     """Import one scene of another map (by id), with its graphs and its edges to scenes of this map.
 
     Repairs damaged arrays of a scene that is already in this map.
@@ -145,7 +108,7 @@ def import_scene(into: Store, source: Store, scene: str) -> MergeResult:
         transfer.priors()
         transfer.observations()
         transfer.photos()
-        return replace(_merged(transfer, None), notes=())
+        return replace(_report(transfer, None), notes=())
 
 
 def _check_shared(transfer: Transfer, scene: str) -> None:
@@ -162,14 +125,15 @@ def _check_shared(transfer: Transfer, scene: str) -> None:
         )
 
 
-def _merged(transfer: Transfer, revision: int | None) -> MergeResult:
-    counted = {field.name for field in fields(MergeResult) if field.type == "int"} - {"num_bytes"}
-    return MergeResult(
-        **{noun: transfer.counts[noun] for noun in counted},
-        renamed=tuple(transfer.renamed),
+def _report(transfer: Transfer, revision: int | None) -> MergeReport:
+    nouns = [field.name.removeprefix("num_") for field in fields(MergeReport) if field.name.startswith("num_")]
+    return MergeReport(
+        map=transfer.into.location,
+        from_map=transfer.source.location,
+        renamed=dict(transfer.renamed),
         revision=revision,
-        num_bytes=transfer.counts["bytes"],
         notes=tuple(dict.fromkeys(transfer.notes)),
+        **{f"num_{noun}": transfer.counts[noun] for noun in nouns},
     )
 
 

@@ -32,7 +32,6 @@ from gsmap.store.error_translation import set_display_name, translate_errors
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
 from gsmap.store.indexes import Indexes
-from gsmap.store.integrity import CheckResult, PruneResult
 from gsmap.store.leases import Leases
 from gsmap.store.models import Models
 from gsmap.store.object_arrays import ObjectArrays
@@ -47,6 +46,7 @@ from gsmap.store.revisions import Revisions
 from gsmap.store.scenes import Scenes
 from gsmap.store.world import WorldObservations
 from gsmap.types.progress import Progress
+from gsmap.types.rows.maps import CheckReport, PruneReport
 from gsmap.version import __version__
 
 if TYPE_CHECKING:
@@ -346,8 +346,8 @@ class Store:
                 code="wrong_catalog",
             )
 
-    def check(self, progress: Progress | None = None) -> CheckResult:
-        """Read every byte of the map and compare it with its digests; see `gsmap.store.integrity.CheckResult`.
+    def check(self, progress: Progress | None = None) -> CheckReport:
+        """Read every byte of the map and compare it with its digests; see `gsmap.store.integrity.check`.
 
         Checks the branches and tags of a map, too, but only the branch if one is open.
         """
@@ -366,17 +366,18 @@ class Store:
                         location=None if place.is_tag else place.location,
                     )
             except StoreError as error:
-                more = CheckResult((str(error),), (), 0, 0)
+                more = CheckReport(ok=False, problems=(str(error),))
             problems = tuple(f"{place.branch}: {problem}" for problem in more.problems)
             found = replace(
                 found,
+                ok=found.ok and more.ok,
                 problems=found.problems + problems,
                 num_groups=found.num_groups + more.num_groups,
                 num_bytes=found.num_bytes + more.num_bytes,
             )
         return found
 
-    def prune(self, *, keep_revisions: int | None = None, dry_run: bool = False) -> PruneResult:
+    def prune(self, *, keep_revisions: int | None = None, dry_run: bool = False) -> PruneReport:
         """Reclaim arrays that no kept revision uses, and leftovers of crashes; see `gsmap.store.integrity.prune`."""
         return integrity.prune(self.catalog, self.arrays, keep_revisions=keep_revisions, dry_run=dry_run)
 

@@ -53,7 +53,7 @@ def test_a_branch_changes_nothing_of_the_map_and_copies_no_array(store):
     (store.folder / "settings.toml").write_text("[optimize]\n")
     arrays = bytes_of(store.home / "arrays")
     made = store.branches.make("what-if")
-    assert (made.name, made.is_tag, made.num_scenes, made.revision) == ("what-if", False, 1, 1)
+    assert (made.name, made.kind, made.num_scenes, made.revision) == ("what-if", "branch", 1, 1)
     assert bytes_of(store.home / "arrays") == arrays
     with Store.open(at(store, "what-if")) as branch:
         assert (branch.home, branch.folder) == (store.home, store.home / "branches" / "what-if")
@@ -197,7 +197,7 @@ def test_prune_refuses_while_a_branch_cannot_be_read(store):
     assert any(problem.startswith("b: ") for problem in store.check().problems)
     assert [b.name for b in store.branches.list()] == ["b"]
     store.branches.delete("b")
-    assert store.prune().scenes == ("scene0",)
+    assert store.prune().scene_names == ("scene0",)
 
 
 def flips(path, text):

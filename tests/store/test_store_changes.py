@@ -265,7 +265,7 @@ def test_they_travel_with_their_scenes(store, other):
     save_comparison(other, b, c, made_change(TABLE))
     other.changes.review(2, "confirm", "seen")
     merged = merge(store, other)
-    assert (merged.comparisons, merged.change_reviews) == (3, 1)
+    assert (merged.num_comparisons, merged.num_change_reviews) == (3, 1)
     found = {(one.older, one.newer): one for one in store.changes.current()}
     assert found.keys() == {(a, b), (b, c)}
     chair = found[a, b].changes[0]
@@ -273,12 +273,12 @@ def test_they_travel_with_their_scenes(store, other):
     assert [word.note for word in store.changes.reviews(chair.number)] == ["seen"]
     assert store.check().ok
     again = merge(store, other)
-    assert (again.comparisons, again.change_reviews, again.num_bytes) == (0, 0, 0)
+    assert (again.num_comparisons, again.num_change_reviews, again.num_bytes) == (0, 0, 0)
     other.changes.review(4, "reject")
-    assert merge(store, other).change_reviews == 1
+    assert merge(store, other).num_change_reviews == 1
     with Store.create(store.home.with_name("part.gsmap")) as part:
         done = split(store, part, [a, b])
-        assert (done.comparisons, len(part.changes.current())) == (2, 1)
+        assert (done.num_comparisons, len(part.changes.current())) == (2, 1)
         assert len(groups(part)) == 1  # those of the comparison that counts
         assert part.check().ok
 
@@ -290,7 +290,7 @@ def test_what_both_maps_found_is_one_change(store, other, ids):
     other.changes.review(2, "confirm", "there")
     save_comparison(store, *ids, made_change(CHAIR), version=2)
     merged = merge(store, other)
-    assert (merged.comparisons, merged.change_reviews) == (1, 1)
+    assert (merged.num_comparisons, merged.num_change_reviews) == (1, 1)
     (mine,) = store.changes.current()
     assert numbers(mine) == [1]
     assert mine.changes[0].status == "confirmed"

@@ -78,7 +78,7 @@ def test_a_full_map_is_read(full, mode):
         assert len(store.revisions.get().poses) == 1
         report = store.check()
         assert (report.problems, report.orphans, report.unverified) == ((), (), ())
-        assert store.prune(dry_run=True).scenes == ("gone",)
+        assert store.prune(dry_run=True).scene_names == ("gone",)
 
 
 def test_a_full_map_is_read_after_its_writer_was_killed(disk):
@@ -122,7 +122,7 @@ def test_prune_makes_room_on_a_full_disk(full):
     """There is nothing here that no row names, so that bytes have to go before their rows."""
     with Store.open(full) as store:
         pruned = store.prune()
-        assert pruned.scenes == ("gone",)
+        assert pruned.scene_names == ("gone",)
         assert pruned.num_bytes > 100_000
         assert store.check().problems == ()
         assert store.check().orphans == ()
@@ -189,7 +189,7 @@ def test_a_prune_that_was_killed_on_a_full_disk(full, monkeypatch):
         assert store.scenes.add(make_gaussians(3000, seed=1, degree=2), make_cameras(), name="back")[1]
         assert len(store.scenes.gaussians("back")) == 3000
         store.scenes.remove("back")
-        assert store.prune().scenes == ("back",)
+        assert store.prune().scene_names == ("back",)
         assert store.check().ok
 
 

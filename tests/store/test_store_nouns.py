@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from store_samples import key, make_cameras, make_gaussians
 
 from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError, StoreError
-from gsmap.store import MANUAL, PruneResult, Store
+from gsmap.store import MANUAL, Store
 from gsmap.types import (
     EdgeOutcome,
     NodeLayer,
@@ -21,6 +21,7 @@ from gsmap.types import (
     Sim3,
     Tile,
 )
+from gsmap.types.rows.maps import PruneReport
 
 
 def pose(seed: int = 0, scale: float = 1.0) -> Sim3:
@@ -528,10 +529,10 @@ def test_prune_keeps_what_a_revision_names(tmp_path):
         store.scenes.remove("scene0")
         store.scenes.remove("scene2")
         would = store.prune(dry_run=True)
-        assert (would.scenes, would.num_graphs, would.dry_run) == (("scene2",), 1, True)
+        assert (would.scene_names, would.num_graphs, would.dry_run) == (("scene2",), 1, True)
         assert len(store.scenes.gaussians(scenes[2].id)) == 500
         done = store.prune()
-        assert (done.scenes, done.num_graphs, done.num_bytes) == (("scene2",), 1, would.num_bytes)
+        assert (done.scene_names, done.num_graphs, done.num_bytes) == (("scene2",), 1, would.num_bytes)
         assert done.num_bytes > 10_000
         assert len(store.scenes.gaussians(scenes[0].id)) == 500  # revision 1 can still be exported
         with raises(NotFoundError, code="scene_removed"):
@@ -539,9 +540,9 @@ def test_prune_keeps_what_a_revision_names(tmp_path):
         assert store.check().ok
 
         store.revisions.save(PoseGraph({scenes[1].id: ScenePose(scenes[1].id, pose(), 0, "placed")}))
-        assert store.prune().scenes == ()
+        assert store.prune().scene_names == ()
         dropped = store.prune(keep_revisions=1)
-        assert (dropped.scenes, dropped.revisions) == (("scene0",), (1,))
+        assert (dropped.scene_names, dropped.revisions) == (("scene0",), (1,))
         assert [bool(r.dropped_at) for r in store.revisions.list()] == [True, False]
         with raises(NotFoundError, code="revision_dropped"):
             store.revisions.get(1)
@@ -569,8 +570,8 @@ def test_a_dry_run_counts_everything_and_changes_nothing(store, two_scenes, tmp_
         would = reader.prune(dry_run=True)
     assert would == store.prune(dry_run=True)
     assert {p: p.stat().st_mtime_ns for p in store.folder.rglob("*")} == before
-    assert (would.scenes, would.num_orphans, would.num_models) == (("scene1",), 1, 1)
+    assert (would.scene_names, would.num_orphans, would.num_models) == (("scene1",), 1, 1)
     assert would.num_bytes > 11_000
     assert store.prune() == replace(would, dry_run=False)
-    assert store.prune(dry_run=True) == PruneResult(dry_run=True)
+    assert store.prune(dry_run=True) == PruneReport(dry_run=True)
     assert store.check().ok

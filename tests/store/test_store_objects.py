@@ -138,7 +138,7 @@ def test_merging_maps_joins_numbers_and_words(store, scenes, tmp_path):
     store.objects.edit(2, name="sofa")
     store.objects.edit(3, label="lamp", same_as=1)
     with Store.create(tmp_path / "part") as part:
-        assert merging.split(store, part, [june]).objects == 2
+        assert merging.split(store, part, [june]).num_objects == 2
         assert part.objects.match_numbers([{june: A}, {june: FAR}]) == [1, 2]
         assert part.objects.annotations()["o1"].name == "sofa"
         assert part.objects.annotations()["o2"].same_as == "", "o1 stayed behind"
@@ -147,13 +147,13 @@ def test_merging_maps_joins_numbers_and_words(store, scenes, tmp_path):
         other.scenes.add(make_gaussians(50, 9), make_cameras(), name="attic")
         keep_objects(other, {other.scenes.get("attic").id: A})
         done = merging.merge(other, store)
-        assert (done.objects, done.object_facts) == (3, 3)
+        assert (done.num_objects, done.num_object_facts) == (3, 3)
         assert other.objects.annotations()["o4"].same_as == "o2", "their numbers become ours"
         with Store.open(tmp_path / "part") as part:
             again = merging.merge(other, part)
-        assert (again.objects, again.object_facts) == (0, 1)
+        assert (again.num_objects, again.num_object_facts) == (0, 1)
         assert other.objects.annotations()["o3"].note == "red"
-        assert merging.merge(other, store).object_facts == 0, "again it adds nothing"
+        assert merging.merge(other, store).num_object_facts == 0, "again it adds nothing"
 
 
 def test_a_purge_forgets_what_only_that_scene_showed(store, scenes):

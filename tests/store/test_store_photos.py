@@ -128,12 +128,12 @@ def test_photos_go_with_their_scene(store, scene, tmp_path):
     store.photos.add(kept_photo(scene, 1), JPEG)
     store.photos.add(kept_photo(other, 2), JPEG + b"2")
     with Store.create(tmp_path / "part") as part:
-        assert merging.split(store, part, [scene]).photos == 1
+        assert merging.split(store, part, [scene]).num_photos == 1
         assert [one.sighting.name for one in part.photos.list()] == ["photo1.jpg"]
         assert part.photos.jpeg(part.photos.list()[0].number) == JPEG
         assert part.check().problems == ()
-        assert merging.merge(part, store).photos == 1
-        assert merging.merge(part, store).photos == 0, "again it adds nothing"
+        assert merging.merge(part, store).num_photos == 1
+        assert merging.merge(part, store).num_photos == 0, "again it adds nothing"
         assert len(part.photos.list()) == 2
         store.photos.remove(store.photos.find("photo2.jpg").number)
         merging.merge(part, store)

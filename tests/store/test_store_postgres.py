@@ -51,8 +51,8 @@ def test_the_whole_store_on_postgres(tmp_path, postgres_database):
         store.exports.add_tile(export, tile("a.ply", [a, b]))
         assert store.exports.tiles(tmp_path / "out")[0].num_gaussians == 42
         store.scenes.remove("a-2")
-        assert store.prune().scenes == ()
-        assert store.prune(keep_revisions=0).scenes == ("a-2",)
+        assert store.prune().scene_names == ()
+        assert store.prune(keep_revisions=0).scene_names == ("a-2",)
         assert store.check().ok
         assert "PostgreSQL" in store.check().unverified[0]
     with raises(StoreError, code="database_not_empty"):

@@ -146,7 +146,7 @@ def test_a_removed_scene_can_be_forgotten_and_comes_back_only_by_ingest(place, t
         assert finds(place, NAME, NOTE) == []
         with Store.open(tmp_path / "copy.gsmap", "r") as copy:
             merged = merge(m.store, copy)
-            assert merged.scenes == 0
+            assert merged.num_scenes == 0
             assert any("was purged from this map" in note for note in merged.notes)
             with raises(NotFoundError, code="scene_removed"):
                 m.restore_scene(secret, tmp_path / "copy.gsmap")

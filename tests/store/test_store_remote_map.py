@@ -157,7 +157,7 @@ def test_prune_and_purge_reclaim_objects(home, tmp_path):
     home.models.remove("net")
     assert len(place.list("arrays/")) == 3
     home.scenes.remove("a")
-    assert home.prune().scenes == ("a",)
+    assert home.prune().scene_names == ("a",)
     assert place.list("models/") == {}
     assert len(place.list("arrays/")) == 1
     with gsmap.map.open(home.location) as m:

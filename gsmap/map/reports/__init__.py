@@ -13,13 +13,12 @@ from gsmap.map.reports.revisions import (
     update_report,
 )
 from gsmap.map.reports.scenes import SCENE_STATUSES, ingest_row, pose_rows, scene_row, scene_rows
-from gsmap.map.reports.upkeep import check_report, export_report, model_rows, prune_report, setting_rows, tile_rows
+from gsmap.map.reports.upkeep import export_report, model_rows, setting_rows, tile_rows
 from gsmap.map.reports.world import world_report
 
 __all__ = [
     "EDGE_STATUSES",
     "SCENE_STATUSES",
-    "check_report",
     "checked_pair",
     "edge_row",
     "edge_rows",
@@ -36,7 +35,6 @@ __all__ = [
     "pose_change_rows",
     "pose_rows",
     "prior_row",
-    "prune_report",
     "revision_row",
     "revision_rows",
     "rows_of_edges",

@@ -10,10 +10,9 @@ from gsmap.map.reports.common import names, refs
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.settings import leaves
 from gsmap.store import Store
-from gsmap.store.integrity import CheckResult, PruneResult
 from gsmap.types import Tile
 from gsmap.types.rows.exports import ExportReport, TileRow
-from gsmap.types.rows.maps import CheckReport, ModelRow, PruneReport, SettingRow
+from gsmap.types.rows.maps import ModelRow, SettingRow
 
 if TYPE_CHECKING:
     from gsmap.export import ExportResult
@@ -83,27 +82,3 @@ def setting_rows(settings: Settings) -> list[SettingRow]:
         SettingRow(name=leaf.name, value=leaf.value, default=defaults.get(leaf.name), unit=leaf.unit, doc=leaf.meaning)
         for leaf in leaves(settings)
     ]
-
-
-def check_report(found: CheckResult) -> CheckReport:
-    """Return the result of a check of every stored byte."""
-    return CheckReport(
-        ok=found.ok,
-        problems=found.problems,
-        orphans=found.orphans,
-        num_groups=found.num_groups,
-        num_bytes=found.num_bytes,
-        unverified=found.unverified,
-    )
-
-
-def prune_report(pruned: PruneResult, dry_run: bool) -> PruneReport:
-    """Return the data that a prune reclaimed, or would reclaim."""
-    return PruneReport(
-        dry_run=dry_run,
-        scene_names=tuple(pruned.scenes),
-        revisions=tuple(pruned.revisions),
-        num_graphs=pruned.num_graphs,
-        num_orphans=pruned.num_orphans,
-        num_bytes=pruned.num_bytes,
-    )

@@ -30,6 +30,7 @@ from gsmap.store.error_translation import translate_errors
 from gsmap.store.storage import Storage
 from gsmap.store.store import Store
 from gsmap.types.progress import Progress, silent
+from gsmap.types.rows.backups import CloneReport
 from gsmap.version import __version__
 
 _TRIES = 4  # attempts while other processes prune
@@ -49,24 +50,6 @@ class RestoreResult:
     path: Path
     snapshot: Snapshot
     schema: str
-
-
-@dataclass(frozen=True)
-class CloneResult:
-    """A cloned map.
-
-    Args:
-        path: of the clone.
-        map_id: its own id.
-        num_linked, num_copied: numbers of files shared with the other map, and of copies.
-        num_bytes_copied: size of the copies.
-    """
-
-    path: Path
-    map_id: str
-    num_linked: int
-    num_copied: int
-    num_bytes_copied: int
 
 
 def restore(
@@ -111,7 +94,7 @@ def restore(
     return RestoreResult(target, chosen, state.schema)
 
 
-def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silent) -> CloneResult:
+def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silent) -> CloneReport:
     """Clone a map: a new id, its own catalog (SQLite), and shared arrays where the disk supports hard links.
 
     Arrays are never changed in place, so that changes of one map do not affect the other. Branches, exports, backups
@@ -141,11 +124,11 @@ def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silen
     )
 
 
-def _note(store: Store, made: CloneResult) -> None:
+def _note(store: Store, made: CloneReport) -> None:
     """Record a clone in the original map, as a place where purged scenes may still exist."""
     if store.catalog.writable:
         try:
-            store.backups.add(str(made.path), f"clone {made.map_id}", made.num_bytes_copied)
+            store.backups.add(made.path, f"clone {made.map_id}", made.num_bytes_copied)
         except GsmapError as error:
             _log.warning("the clone is complete, but the map could not record it: %s", error)
 
@@ -189,7 +172,7 @@ def _fetch_all(backup: Backup, files: list[StoredFile], folder: Path, progress: 
             raise
 
 
-def _link_all(store: Store, state: MapState, folder: Path, target: Path, progress: Progress) -> CloneResult:
+def _link_all(store: Store, state: MapState, folder: Path, target: Path, progress: Progress) -> CloneReport:
     linked = copied = num_bytes = 0
     for i, file in enumerate(state.files):
         place = folder / file.path
@@ -208,7 +191,14 @@ def _link_all(store: Store, state: MapState, folder: Path, target: Path, progres
                 _write(place, chunks)
             copied, num_bytes = copied + 1, num_bytes + file.size_bytes
         progress(i / len(state.files), f"linking, {i} of {len(state.files)} files")
-    return CloneResult(target, uuid.uuid4().hex, linked, copied, num_bytes)
+    return CloneReport(
+        path=str(target),
+        map_id=uuid.uuid4().hex,
+        source_map_id=store.id,
+        num_linked=linked,
+        num_copied=copied,
+        num_bytes_copied=num_bytes,
+    )
 
 
 def _write(path: Path, chunks: Iterator[bytes]) -> None:

@@ -212,10 +212,10 @@ class CheckReport(Row):
 
     ok: bool
     problems: tuple[str, ...]
-    orphans: tuple[str, ...]
-    num_groups: int
-    num_bytes: int
-    unverified: tuple[str, ...]
+    orphans: tuple[str, ...] = ()
+    num_groups: int = 0
+    num_bytes: int = 0
+    unverified: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -228,6 +228,7 @@ class PruneReport(Row):
         revisions: numbers of the revisions that are deleted.
         num_graphs: number of deleted graphs.
         num_orphans: number of deleted folders of interrupted work.
+        num_models: number of deleted copies of removed models.
         num_bytes: bytes freed on disk; a dry run does not count the catalog.
     """
 
@@ -237,12 +238,13 @@ class PruneReport(Row):
         "num_bytes": "bytes",
     }
 
-    dry_run: bool
-    scene_names: tuple[str, ...]
-    revisions: tuple[int, ...]
-    num_graphs: int
-    num_orphans: int
-    num_bytes: int
+    dry_run: bool = False
+    scene_names: tuple[str, ...] = ()
+    revisions: tuple[int, ...] = ()
+    num_graphs: int = 0
+    num_orphans: int = 0
+    num_models: int = 0
+    num_bytes: int = 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
