@@ -54,8 +54,9 @@ class Prior:
     Args:
         scene: scene id.
         S_map_scene: expected pose.
-        sigmas: (7,) standard deviations [rot_rad (3), trans_m (3), log_scale], inf where nothing is known.
-        up: (3,) direction against gravity in the scene's frame, if it is known; +z of the map should look that way.
+        sigmas: (7,) standard deviations [rotation (3, rad), translation (3, the scene's unit), log scale], infinite (in
+            JSON null) if unconstrained.
+        up: (3,) direction against gravity in the scene's frame; None if it is unknown.
         up_sigma_rad: standard deviation of that direction.
     """
 

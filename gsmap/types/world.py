@@ -208,16 +208,17 @@ class Residual:
     """The residual of one observation.
 
     Args:
-        kind: ``point``, ``image`` (a point in one photo), ``fix`` or ``bar``.
-        name: of the point, photo or bar.
-        scene: id of the scene; empty for a point, which may be seen from several.
-        use: ``used``, ``outlier`` (it contradicts the others, and was left out), ``check`` (held out) or ``unused``.
-        error_m: east, north, up from the surveyed to the estimated position; for a bar the estimated minus the measured
-            length; empty if unknown.
-        sigma_m: standard deviations of these.
-        error_px: for an image: column, row from the picked to the estimated position.
+        kind: ``point`` (a control point), ``image`` (its pixel in one photo), ``fix`` (a position of a camera or scene)
+            or ``bar`` (a distance).
+        name: name of the control point, the point and its photo, the photo, or the bar.
+        scene: id of the scene; empty for a control point, which several scenes may show.
+        use: ``used``, ``outlier`` (contradicts the others, left out), ``check`` (held out) or ``unused``.
+        error_m: east, north, up in metres from the surveyed to the estimated position; for a bar the estimated minus
+            the measured length; empty if unknown and for images.
+        sigma_m: standard deviations of ``error_m``.
+        error_px: for an image, column and row from the picked to the estimated position.
         statistic: chi-square against all other observations, by Baarda's data snooping; None without redundancy.
-        dof: its degrees of freedom.
+        dof: degrees of freedom of ``statistic``.
         reason: reason why it is an outlier or unused, or empty.
     """
 
@@ -264,16 +265,19 @@ class Contradiction:
 
     Args:
         group: ``points`` (control points), ``photos`` (of captures), ``scenes`` (surveyed scenes) or ``bars``.
-        against: the group that it contradicts; the same kind where a group contradicts itself.
-        cause: the likeliest reason, of `CAUSES`.
+        against: contradicted group; the same group if it contradicts itself.
+        cause: the likeliest reason: ``altitude_zero``, ``feet`` (taken for metres), ``above_takeoff`` (heights above
+            take-off), ``height_system`` (ellipsoidal against orthometric heights), ``vertical_shift`` or
+            ``horizontal_shift`` (no known reason, another datum or flight), ``shape`` (of another flight or place),
+            ``scale`` (another unit of length) or ``split`` (the group contradicts itself).
         other_causes: further reasons that explain it as well.
-        kept: the side that is solved from: ``against``, ``group``, or ``none`` where the observations cannot tell.
-        offset_m: (3,) east, north, up of the group less where the other group has it; empty of bars.
-        sigma_m: (3,) its standard deviations, common errors included; empty of bars.
-        ratio: of bars: measured length by the length in the map; None of the other kinds.
-        count: observations of the group that differ so.
-        scenes: ids of the captures, of photos and surveyed scenes.
-        text: all this in a sentence.
+        kept: side that is used: ``against``, ``group``, or ``none`` if nothing decides.
+        offset_m: east, north, up of the group relative to the other group; empty for bars.
+        sigma_m: standard deviations of ``offset_m``, common errors included; empty for bars.
+        ratio: for bars, measured length divided by the length in the map; None for other groups.
+        count: number of contradicting observations of the group.
+        scenes: ids of their captures.
+        text: description in one sentence.
     """
 
     group: str

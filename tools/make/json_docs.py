@@ -7,10 +7,11 @@
 
 from __future__ import annotations
 
+import re
 import types
 import typing
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
@@ -70,8 +71,8 @@ def docs_of(row: type[Row]) -> dict[str, str]:
     """Return the meaning of each field, including inherited ones."""
     out: dict[str, str] = {}
     for cls in reversed(row.__mro__):
-        if issubclass(cls, Row):
-            out |= field_docs(cls)
+        if is_dataclass(cls):
+            out |= {name: re.sub(r"\bNone\b", "null", meaning) for name, meaning in field_docs(cls).items()}
     return out
 
 

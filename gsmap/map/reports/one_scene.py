@@ -93,15 +93,7 @@ def prior_row(store: Store, scene: Scene) -> PriorRow | None:
     outcome = "not solved yet"
     if newest is not None and canonical(store.priors.of(scene.id, newest.created_at)) == canonical(prior):
         outcome = "outweighed by the edges" if scene.id in newest.provenance.contradicted_priors else "used"
-    return PriorRow(
-        scene=scene.id,
-        scene_name=scene.name,
-        S_map_scene=prior.S_map_scene,
-        sigmas=prior.sigmas,
-        up=prior.up,
-        up_sigma_rad=prior.up_sigma_rad,
-        outcome=outcome,
-    )
+    return PriorRow(**vars(prior) | {"scene": scene.id}, scene_name=scene.name, outcome=outcome)
 
 
 def _edges_of(store: Store, scene: Scene) -> tuple[SceneEdgeRow, ...]:

@@ -107,18 +107,9 @@ def _contradiction_row(one: Contradiction, name_of: Mapping[str, str]) -> Contra
 def residual_row(row: Residual, name_of: Mapping[str, str]) -> ResidualRow:
     """Return a residual as a row."""
     return ResidualRow(
-        kind=row.kind,
-        name=row.name,
-        scene=row.scene,
+        **vars(row),
         scene_name=name_of.get(row.scene, ""),
-        use=row.use,
-        error_m=row.error_m,
         size_m=float(np.linalg.norm(row.error_m)) if row.error_m else None,
-        sigma_m=row.sigma_m,
-        error_px=row.error_px,
-        statistic=row.statistic,
-        dof=row.dof,
-        reason=row.reason,
         reason_code=reason_code(row.reason),
     )
 

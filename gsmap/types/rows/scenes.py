@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from gsmap.types.pose_graph import Prior
 from gsmap.types.rows.base import Row, coordinates
 from gsmap.types.sim3 import Sim3
 
@@ -193,28 +194,17 @@ class SceneEdgeRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PriorRow(Row):
+class PriorRow(Prior, Row):
     """The pose prior of a scene.
 
     Args:
-        scene: id.
-        scene_name: name.
-        S_map_scene: the expected pose.
-        sigmas: (7,) standard deviations [rotation (3, rad), translation (3, the scene's unit), log scale]; null if
-            unconstrained.
-        up: (3,) up direction in the scene's frame; null if not specified.
-        up_sigma_rad: standard deviation of that direction.
+        scene_name: name of the scene.
         outcome: ``used``, ``outweighed by the edges``, or ``not solved yet``.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"scene_name": "scene", "outcome": "prior"}
 
-    scene: str
     scene_name: str
-    S_map_scene: Sim3
-    sigmas: np.ndarray
-    up: np.ndarray | None
-    up_sigma_rad: float
     outcome: str
 
 

@@ -10,27 +10,16 @@ import numpy as np
 
 from gsmap.types.rows.base import Row, coordinates
 from gsmap.types.sim3 import Sim3
+from gsmap.types.world import Contradiction, Residual
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ResidualRow(Row):
+class ResidualRow(Residual, Row):
     """The residual of one observation of the world.
 
     Args:
-        kind: ``point`` (a control point), ``image`` (its pixel in one photo), ``fix`` (a position of a camera or scene)
-            or ``bar`` (a distance).
-        name: name of the control point, the point and its photo, the photo, or the bar.
-        scene: id of the scene; empty for a control point, which several scenes may show.
         scene_name: name of the scene; empty for a control point.
-        use: ``used``, ``outlier`` (contradicts the others, left out), ``check`` (held out) or ``unused``.
-        error_m: east, north, up in metres from the surveyed to the estimated position; for a bar the estimated minus
-            the measured length; empty if unknown and for images.
         size_m: length of ``error_m``; null if it is empty.
-        sigma_m: standard deviations of ``error_m``.
-        error_px: for an image, column and row from the picked to the estimated position.
-        statistic: chi-square against all other observations; null without redundancy.
-        dof: degrees of freedom of ``statistic``.
-        reason: reason why it is an outlier or unused, or empty.
         reason_code: code of the reason, a key of `gsmap.reason_codes.REASONS`, or empty.
     """
 
@@ -47,18 +36,8 @@ class ResidualRow(Row):
         "reason": "reason",
     }
 
-    kind: str
-    name: str
-    scene: str
     scene_name: str
-    use: str
-    error_m: tuple[float, ...]
     size_m: float | None
-    sigma_m: tuple[float, ...]
-    error_px: tuple[float, ...]
-    statistic: float | None
-    dof: int
-    reason: str
     reason_code: str = ""
 
     @property
@@ -106,25 +85,11 @@ class ResidualSummaryRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ContradictionRow(Row):
+class ContradictionRow(Contradiction, Row):
     """A group of observations that contradicts another group by more than the common errors of both groups explain.
 
     Args:
-        group: ``points`` (control points), ``photos`` (of captures), ``scenes`` (surveyed scenes) or ``bars``.
-        against: contradicted group; the same group if it contradicts itself.
-        cause: the likeliest reason: ``altitude_zero``, ``feet`` (taken for metres), ``above_takeoff`` (heights above
-            take-off), ``height_system`` (ellipsoidal against orthometric heights), ``vertical_shift`` or
-            ``horizontal_shift`` (no known reason, another datum or flight), ``shape`` (of another flight or place),
-            ``scale`` (another unit of length) or ``split`` (the group contradicts itself).
-        other_causes: further reasons that explain it as well.
-        kept: side that is used: ``against``, ``group``, or ``none`` if nothing decides.
-        offset_m: east, north, up of the group relative to the other group; empty for bars.
-        sigma_m: standard deviations of ``offset_m``, common errors included; empty for bars.
-        ratio: for bars, measured length divided by the length in the map; null for other groups.
-        count: number of contradicting observations of the group.
-        scenes: ids of their captures.
-        scene_names: names of their captures.
-        text: description in one sentence.
+        scene_names: names of the captures.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -136,18 +101,7 @@ class ContradictionRow(Row):
         "offset": "offset E N U, m",
     }
 
-    group: str
-    against: str
-    cause: str
-    other_causes: tuple[str, ...]
-    kept: str
-    offset_m: tuple[float, ...]
-    sigma_m: tuple[float, ...]
-    ratio: float | None
-    count: int
-    scenes: tuple[str, ...]
     scene_names: tuple[str, ...]
-    text: str
 
     @property
     def offset(self) -> str:
