@@ -283,7 +283,13 @@ class PairRenderer:
         _save(self.picture(row), path)
 
     def picture(self, row: ChangeRow, side_px: int = 320) -> np.ndarray:
-        """Render the place before and after a change, (H, W, 3) uint8."""
+        """Render the place before and after a change beside each other, (H, W, 3) uint8."""
+        from gsmap.view.change_picture import beside
+
+        return beside(*self.views(row, side_px))
+
+    def views(self, row: ChangeRow, side_px: int) -> tuple[np.ndarray, np.ndarray]:
+        """Render the place before and after a change from the same camera, (H, W, 3) uint8 each."""
         from gsmap.view.change_picture import draw_change
 
         change = change_arrays(self._store, parse_change_id(row.id))

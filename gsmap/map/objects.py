@@ -101,17 +101,34 @@ class MapObjects:
     @cached_property
     def rooms_of(self) -> dict[str, str]:
         """Room id of each object with a known room, by object id."""
-        out = {}
-        for component, (level, rooms) in self.rooms.items():
+        out: dict[str, str] = {}
+        for component in self.rooms:
             mine = [thing for thing in self.objects if thing.component == component]
-            places = np.array([thing.position for thing in mine]).reshape(-1, 3) @ level.T * self.metres[component]
-            for i in reversed(range(len(rooms))):  # an object in two rooms belongs to the larger
-                low, high = rooms[i].box
-                near = ((places[:, :2] >= low[:2]) & (places[:, :2] <= high[:2])).all(1)
-                for k in np.flatnonzero(near):
-                    if rooms[i].holds(places[k]):
-                        out[mine[k].id] = self._room_id(component, i)
+            rooms = self.rooms_at(component, np.array([thing.position for thing in mine]).reshape(-1, 3))
+            out |= {thing.id: room for thing, room in zip(mine, rooms, strict=True) if room is not None}
         return out
+
+    def rooms_at(self, component: int, positions: np.ndarray) -> list[str | None]:
+        """Return the id of the room at each position (N, 3) of a component's frame; None outside of rooms."""
+        level, rooms = self.rooms[component]
+        places = positions @ level.T * self.metres[component]
+        out: list[str | None] = [None] * len(places)
+        for i in reversed(range(len(rooms))):  # a position in two rooms belongs to the larger
+            low, high = rooms[i].box
+            near = ((places[:, :2] >= low[:2]) & (places[:, :2] <= high[:2])).all(1)
+            for k in np.flatnonzero(near):
+                if rooms[i].holds(places[k]):
+                    out[k] = self._room_id(component, i)
+        return out
+
+    def room_of_box(self, component: int, box: np.ndarray) -> str | None:
+        """Return the id of the room that holds most of a box (2, 3) of a component's frame; None outside of rooms."""
+        if component not in self.rooms:
+            return None
+        sides = np.linspace(box[0], box[1], 7)[1:-1].T
+        found = self.rooms_at(component, np.stack(np.meshgrid(*sides), -1).reshape(-1, 3))
+        known = [room for room in found if room is not None]
+        return max(dict.fromkeys(known), key=known.count) if known else None
 
     @cached_property
     def _first_rooms(self) -> dict[int, int]:

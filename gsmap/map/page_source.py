@@ -15,7 +15,7 @@ from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geometry.transforms import transform_poses
 from gsmap.map import reports
 from gsmap.map.changes import change_row, changes_report, parse_change_id
-from gsmap.map.comparison_pictures import num_views, pair_views, picture_of_change
+from gsmap.map.comparison_pictures import PairRenderer, num_views, pair_views
 from gsmap.map.floor_plans import MAX_GAUSSIANS, MAX_SCENES, box_of, plan_of_component, read_scene
 from gsmap.map.metric_scales import map_metres
 from gsmap.map.object_pictures import ObjectPictures
@@ -169,9 +169,13 @@ class MapPageSource:
             return found
 
         picture = None if plan.picture is None else base64.b64encode(plan.picture).decode()
+        # Rows of a projection: share of the width, and of the height from the top, of a point (x, y, z, 1) of the map.
+        along = plan.R_plan_map[:2] * plan.metres_per_unit / span[:, None]
+        rows = np.column_stack([along * [[1], [-1]], [-low[0] / span[0], 1 + low[1] / span[1]]])
         return {
             "picture": picture and f"data:image/webp;base64,{picture}",
             "size_m": span.tolist(),
+            "P_plan_map": rows.tolist(),
             "scenes": [
                 {"scene": place, "at": at, "outlines": [place_on_page(ring) for ring in rings]}
                 for place, at, rings in zip(inside, place_on_page(plan.middles), plan.footprints, strict=True)
@@ -209,14 +213,13 @@ class MapPageSource:
         a, b, difference = zip(*looks, strict=True) if looks else ((), (), ())
         return PairPictures(names[: len(looks)], a, b, difference)
 
-    def change_picture(self, change: str) -> np.ndarray:
+    def change_pictures(self, change: str) -> tuple[np.ndarray, np.ndarray]:
         row = change_row(self._store, parse_change_id(change))
-        picture = picture_of_change(self._store, row, _PICTURE_PX)
-        if picture is None:
+        if row.box_m is None:
             raise NotFoundError(
                 f"{change} has no position: its newer capture has no pose; run gsmap update", code="change_unplaced"
             )
-        return picture
+        return PairRenderer(self._store, row.older, row.newer).views(row, _PICTURE_PX)
 
     # --- objects -----------------------------------------------------------------------------------------------------
 
@@ -242,6 +245,11 @@ class MapPageSource:
                 }
                 for row in report.objects
             ],
+            "changes": {
+                one.id: room
+                for one in self.content().changes
+                if (room := known.room_of_box(one.component, one.box)) is not None
+            },
             "relations": [{"a": one.subject, "b": one.other, "kind": one.relation} for one in report.relations],
             "rooms": [
                 {

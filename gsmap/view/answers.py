@@ -87,7 +87,7 @@ class Answers:
                 (r"/merged/(\d{1,8})/(.{1,400})", self._merged),
                 (rf"/edges/({_ID})-({_ID})\.json", self._edge),
                 (rf"/edges/({_ID})-({_ID})/(\d{{1,2}})-(target|source|difference)\.jpg", self._pair_picture),
-                (r"/changes/(c\d{1,9})\.jpg", self._change_picture),
+                (r"/changes/(c\d{1,9})-(before|after)\.jpg", self._change_picture),
                 (r"/revisions/(\d{1,9})\.json", self._revision),
                 (r"/objects/([0-9a-z]{1,12})\.jpg", self._object_picture),
                 (r"/plans/(\d{1,8})\.json", self._plan),
@@ -247,8 +247,12 @@ class Answers:
 
         return self._drawn(wanted, draw)
 
-    def _change_picture(self, change: str) -> Answer:
-        return self._drawn(change, lambda: {change: self._page_source.change_picture(change)})
+    def _change_picture(self, change: str, which: str) -> Answer:
+        def draw() -> dict[str, np.ndarray]:
+            before, after = self._page_source.change_pictures(change)
+            return {f"{change} before": before, f"{change} after": after}
+
+        return self._drawn(f"{change} {which}", draw)
 
     def _object_picture(self, id: str) -> Answer:
         return self._drawn(f"object {id}", lambda: {f"object {id}": self._page_source.object_picture(id)})

@@ -306,7 +306,9 @@ def summary(view: ViewMap, served: ServerState) -> dict[str, Any]:
                 "confidence": _number(one.confidence) or 0.0,
                 "status": one.status,
                 "note": one.note,
-                "pictures": f"changes/{one.id}.jpg" if served.live or one.id in served.drawn else None,
+                "pictures": [f"changes/{one.id}-{name}.jpg" for name in ("before", "after")]
+                if served.live or one.id in served.drawn
+                else None,
             }
             for one in view.changes
             if one.before in at and one.after in at

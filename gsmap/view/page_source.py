@@ -64,7 +64,9 @@ class PageSource(Protocol):
         """Return the names of the cameras that `pair_pictures` would use, without drawing."""
         ...
 
-    def change_picture(self, change: str) -> np.ndarray: ...
+    def change_pictures(self, change: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the place before and after a change from the same camera, (H, W, 3) uint8 each."""
+        ...
 
     def plan(self, component: int) -> dict[str, Any]:
         """Return the floor plan of a component with poses."""

@@ -122,10 +122,11 @@ class _Maker:
         drawn = []
         surest = sorted(view.changes, key=lambda change: -change.confidence)
         for change in surest[: self.params.site_changes if pictures else 0]:
-            picture = self.tried(f"change {change.id}", lambda c=change: self.page_source.change_picture(c.id))  # type: ignore[misc]
-            if picture is not None:
+            pair = self.tried(f"change {change.id}", lambda c=change: self.page_source.change_pictures(c.id))  # type: ignore[misc]
+            if pair is not None:
                 drawn.append(change.id)
-                yield f"changes/{change.id}.jpg", jpeg(picture)
+                for name, picture in zip(("before", "after"), pair, strict=True):
+                    yield f"changes/{change.id}-{name}.jpg", jpeg(picture)
         has_objects = False
         if view.has_objects:
             graph = self.tried("the graph of objects", self.page_source.graph)

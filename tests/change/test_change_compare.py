@@ -185,13 +185,17 @@ def test_the_picture_of_a_change_shows_the_place_before_and_after():
     red = plain(0.9, 0.1, 0.1)
     older, newer = capture([*room, *box(0.9, 1.2, 0.5, 0.4, 0.6, 6, paint=red)], 1), capture(room, 2)
     (found,) = change.compare(older, newer).changes
-    picture = draw_change(older, newer, found.box, found.voxels, side_px=128)
-    assert picture.dtype == np.uint8
-    assert picture.ndim == 3
-    assert picture.shape[2] == 3
-    # The older half shows much of the red box; the newer none of it, but for the lines of the box.
-    width = picture.shape[1] // 2
-    lines = (picture == (255, 64, 64)).all(-1)
-    reddish = (picture[..., 0] > 180) & (picture[..., 1] < 70) & (picture[..., 2] < 70) & ~lines
-    assert reddish[:, :width].mean() > 0.08
-    assert reddish[:, width:].mean() < 0.01
+    before, after = draw_change(older, newer, found.box, found.voxels, side_px=128)
+    assert before.shape == after.shape == (96, 128, 3)
+    reddish = []
+    for picture in (before, after):
+        lines = (picture == (255, 64, 64)).all(-1)
+        reddish.append((picture[..., 0] > 180) & (picture[..., 1] < 70) & (picture[..., 2] < 70) & ~lines)
+    # The red box is seen before, with its surroundings on all sides; after, there are only the lines of its frame.
+    assert 0.02 < reddish[0].mean() < 0.2
+    assert reddish[1].mean() < 0.005
+    rows, columns = np.nonzero(reddish[0])
+    assert rows.min() > 5
+    assert rows.max() < 90
+    assert columns.min() > 5
+    assert columns.max() < 122

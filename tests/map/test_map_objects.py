@@ -148,6 +148,22 @@ def test_the_graph_is_written_and_is_what_networkx_gets(site: Map, tmp_path: Pat
         site.write_graph(tmp_path / "o.x", "dot")
 
 
+def test_a_change_is_in_the_room_of_its_box_and_is_found_on_the_plan(site: Map) -> None:
+    known = compute_objects(site.store, site.settings, lambda *_: None)
+    inside, across, outside = [[1, 1, 0.2], [2, 2, 1]], [[3.2, 1, 0.2], [4.6, 2, 1]], [[5, 5, 0], [6, 6, 1]]
+    assert known.room_of_box(0, np.array(inside, float)) == "r1"
+    assert known.room_of_box(0, np.array(across, float)) == "r1", "some of it"
+    assert known.room_of_box(0, np.array(outside, float)) is None
+    assert known.room_of_box(7, np.array(inside, float)) is None
+    plan = MapPageSource(site.store, site.settings).plan(0)
+    corners = np.array([[0, 0, 0, 1], [4, 0, 0, 1], [4, 3, 0, 1], [4, 3, 2, 1.0]])
+    places = corners @ np.array(plan["P_plan_map"]).T
+    assert ((places > 0) & (places < 1)).all()
+    steps = np.diff(places * plan["size_m"], axis=0)
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=1), [4, 3, 0], atol=0.05)  # height is not seen from above
+    assert steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0] < 0, "y goes down the page, so a left turn is mirrored"
+
+
 def test_ids_stay_when_a_capture_comes_or_a_pose_moves(site: Map) -> None:
     before = {row.id for row in site.objects().objects if row.there}
     placed = site.store.revisions.get()

@@ -114,7 +114,7 @@ def test_the_page_is_told_what_the_store_holds(folder):
         tileset = page.told(hall_["tileset"])
         uri = hall_["tileset"].rsplit("/", 1)[0] + "/" + tileset["root"]["content"]["uri"]
         assert page.ask(uri)[1][:4] == b"glTF"
-        assert page.ask("changes/c1.jpg")[0] == 404
+        assert page.ask("changes/c1-before.jpg")[0] == 404
         assert page.ask(f"edges/{hall_['id']}-{'f' * 32}.json")[0] == 404
     assert list(cache_folder().glob(f"{hall_['id']}*.tree"))
 

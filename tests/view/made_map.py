@@ -70,7 +70,7 @@ def made_map(scenes: int = 12, second_island: int = 2, hostile: bool = False) ->
             "at": rows[i + 1]["captured_at"],
             "confidence": 0.95 - 0.07 * i,
             "status": "open",
-            "pictures": f"changes/c{i + 1}.jpg",
+            "pictures": [f"changes/c{i + 1}-before.jpg", f"changes/c{i + 1}-after.jpg"],
             "note": "",
         }
         for i, kind in enumerate(KINDS)
@@ -270,7 +270,12 @@ class MadeServer:
             return _json(self._detail(rest.removesuffix(".json")))
         if folder == "plans":
             return _json(
-                {"picture": None, "size_m": [12, 6], "scenes": [{"scene": 0, "at": [0.5, 0.5], "outlines": []}]}
+                {
+                    "picture": None,
+                    "size_m": [40, 20],
+                    "P_plan_map": [[1 / 40, 0, 0, 0.1], [0, -1 / 20, 0, 0.5]],
+                    "scenes": [{"scene": 0, "at": [0.5, 0.5], "outlines": []}],
+                }
             )
         if folder == "changes" or rest.endswith(".jpg"):
             return _picture(name), "image/jpeg"
@@ -341,7 +346,7 @@ class MadeServer:
             corners = [[4.0 * k + x, y, 0] for x, y in ((-1, -1), (3, -1), (3, 2), (-1, 2))]
             outline = [[corners[i - 1], corners[i]] for i in range(4)]
             rooms.append({"id": f"r{k + 1}", "component": 0, "outline": outline, "area_m2": 12.0, "doors": [other]})
-        return {"objects": objects, "relations": relations, "rooms": rooms}
+        return {"objects": objects, "relations": relations, "rooms": rooms, "changes": {"c1": "r1", "c2": "r2"}}
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
@@ -385,7 +390,7 @@ def _json(value: object) -> tuple[bytes, str]:
 
 def _picture(name: str) -> bytes:
     """A room drawn with a few boxes; the source's are a little aside."""
-    size = (960, 320) if name.startswith("changes") else (480, 320)
+    size = (480, 320)
     rng = np.random.default_rng(sum(map(ord, name.split("-")[0])))
     ground = np.linspace(150, 60, size[1])[:, None, None] * np.array([1, 0.97, 0.9])
     picture = np.broadcast_to(ground, (size[1], size[0], 3)).copy()

@@ -398,7 +398,7 @@ def test_changes_are_listed_by_kind_and_reviewed(hands, server):
     hands.press("3")
     assert told(hands, "setChanges") == [["c6", "c5", "c4", "c2", "c1", "c3"]]
     hands.click("button.choose", "Replaced")
-    hands.wait("find('img', null)?.naturalWidth === 960")
+    hands.wait("findAll('img').filter((e) => e.naturalWidth).length === 2")
     assert "office east 2024-05 → 11 May 2024 office west 2024-06 11 Jun 2024" in hands.text("gs-time")
     assert "office east 2024-05 (11 May 2024) → office west 2024-06 (11 Jun 2024)" in hands.text("gs-change")
     assert told(hands, "fit")[0] == pytest.approx(np.array([[11.4, -0.5, -0.8], [13.2, 1, 1.6]]))
@@ -411,6 +411,103 @@ def test_changes_are_listed_by_kind_and_reviewed(hands, server):
     hands.press("u")
     hands.says("Undone: change c4")
     assert server.log[-1] == ("withdraw", {"what": "c4", "note": ""})
+
+
+def spots(hands: Hands) -> dict[str, list[float]]:
+    """Middle of each numbered change on the floor plan, as shares of its width and height."""
+    found = """Object.fromEntries(findAll('.spot').map((e) => {
+      const [r, s] = [e.getBoundingClientRect(), e.parentElement.getBoundingClientRect()];
+      return [textOf(e), [(r.x + r.width / 2 - s.x) / s.width, (r.y + r.height / 2 - s.y) / s.height]];
+    }))"""
+    return hands.value(found)
+
+
+def test_a_change_names_its_room_and_is_marked_on_the_floor_plan(hands):
+    hands.value("document.getElementById('canvas').dispatchEvent(new Event('drawn'))")
+    hands.press("3")
+    hands.says("Disappeared in room r2", "gs-time")
+    hands.click("button.choose", "Appeared in room r1")
+    hands.wait("findAll('.spot').length === 6")
+    # c1 has its middle at (0.3, 0.25), c3 6 m further along x.
+    assert spots(hands)["1"] == pytest.approx([0.3 / 40 + 0.1, 0.5 - 0.25 / 20], abs=0.004)
+    assert spots(hands)["3"] == pytest.approx([6.3 / 40 + 0.1, 0.5 - 0.25 / 20], abs=0.004)
+    bold = "findAll('.spot.bold').map((e) => textOf(e))"
+    assert hands.value(bold) == ["1"]
+    assert hands.value("findAll('path.thing').length") == 1
+    assert told(hands, "setHighlighted") == [["c1"]]
+    hands.value("find('[role=gridcell].wide', null).dispatchEvent(new Event('pointerenter'))")
+    assert told(hands, "setHighlighted") == [["c1", "c6"]]
+    assert sorted(hands.value(bold)) == ["1", "6"]
+    hands.value("findAll('.spot').find((e) => textOf(e) === '2').click()")
+    hands.says("Disappeared in room r2", "gs-change")
+
+
+def test_two_captures_are_chosen_and_what_is_known_of_them_is_offered(hands, server):
+    def choose(first: int, second: int) -> str:
+        for place, index in enumerate((first, second)):
+            fill(hands, f"find('#capture-{place}', null)", f"{index:012x}")
+            hands.value("new Promise((rest) => setTimeout(rest, 30))")
+        return hands.text("#known")
+
+    server.map.update(compared=[[6, 7]], uncompared=[[7, 8]], state="s8")
+    hands.press("2")
+    hands.wait("findAll('#capture-0 option, #capture-1 option').length === 30")
+    said = choose(1, 0)
+    assert "Edge used" in said
+    assert "Appeared" in said
+    assert "Not" not in said
+    said = choose(0, 9)
+    assert "gsmap register Plant 4, ground floor --pairs hall 2024-01:stairs 2025-10" in said
+    assert "gsmap changes" in said
+    assert "has no date" in choose(3, 9)
+    assert "different components" in choose(0, 12)
+    hands.wait("globalThis.fake.calls.filter((call) => call[0] === 'show').length > 1", 20)
+    assert "nothing changed" in choose(7, 6)
+    choose(8, 7)
+    hands.click("button", "compare now")
+    idle(hands)
+    assert server.log[-1] == ("compare", {})
+    assert "nothing changed" in hands.text("#known")
+    hands.click("button", "Side by side in 3D")
+    assert told(hands, "setVisible") == [[7]]
+    assert told(hands, "setSplit")[0]["scenes"] == [8]
+    choose(1, 2)
+    hands.click("button", "Edge")
+    hands.says("no cycle confirms it", "gs-edge")
+
+
+def test_the_next_object_is_of_the_list_whatever_tab_is_open(hands):
+    hands.press("4")
+    hands.says("forklift", "gs-things")
+    hands.click("#filter")
+    hands.type("r1")
+    hands.wait("findAll('[role=row]').length === 2")
+    hands.press("Escape", "j")
+    hands.says("chair", "gs-thing")
+    hands.press("1")
+    hands.click("button", "Next")
+    hands.says("red cabinet", "gs-thing")
+    hands.press("j")
+    hands.says("That was the last one")
+    hands.press("k")
+    hands.says("chair", "gs-thing")
+
+
+def test_without_a_3d_view_nothing_is_offered_that_needs_one(hands, server):
+    hands.go(server.url + "?no-webgl")
+    hands.wait("find('gs-plan', null)")
+    needing = "findAll('button, input, label').filter(isShown).map((e) => e.ariaLabel || e.textContent.trim())"
+    words = ("Fly", "3D", "Only", "Show ", "Hide", "Boxes", "Rooms", "Fit", "Clip", "Split", "Measure", "Move by hand")
+    for keys in (("1", "j"), ("2", "j"), ("3", "j"), ("4", "j"), ("Escape", "?")):
+        hands.press("Escape", *keys)
+        hands.value("new Promise((rest) => setTimeout(rest, 200))")
+        found = hands.value(needing)
+        assert [one for one in found if one.startswith(words) or "3D" in one] == [], keys
+    assert "Clip box" not in hands.text("gs-help")
+    hands.press("Escape", "x")
+    hands.says("needs the 3D view")
+    hands.press("3")
+    hands.wait("findAll('.spot').length === 6")
 
 
 def test_no_known_change_is_undated_uncompared_or_unchanged(hands, server):
@@ -781,8 +878,8 @@ def test_five_hundred_scenes_are_a_list_of_what_is_in_sight(built, tmp_path):
 
 def test_names_notes_and_addresses_of_a_map_are_not_trusted(built, tmp_path):
     summary = made_map(hostile=True)
-    summary["changes"][0]["pictures"] = "https://evil.example/x.jpg"
-    summary["changes"][1]["pictures"] = "../../secret.jpg"
+    summary["changes"][0]["pictures"] = ["https://evil.example/x.jpg", "https://evil.example/y.jpg"]
+    summary["changes"][1]["pictures"] = ["../../secret.jpg", "changes/c2-after.jpg"]
     summary["edges"][2]["detail"] = "//evil.example/edges.json"
     summary["scenes"][1]["tags"] = ["<svg onload=window.hacked=1>"]
     made = MadeServer(built, summary)
@@ -802,9 +899,9 @@ def test_names_notes_and_addresses_of_a_map_are_not_trusted(built, tmp_path):
                 hands.value("new Promise((rest) => setTimeout(rest, 100))")
             hands.value("find('[role=tab]', 'Time').click()")
             hands.click("button.choose", "Appeared")
-            hands.says("There is no picture", "gs-change")
+            hands.says("could not be loaded", "gs-change")
             hands.click("button.choose", "Disappeared")
-            hands.says("There is no picture", "gs-change")
+            hands.says("could not be loaded", "gs-change")
             hands.press("2")
             hands.click("button.choose", "kitchen 2024-03")
             hands.value("new Promise((rest) => setTimeout(rest, 100))")

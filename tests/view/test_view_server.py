@@ -357,7 +357,8 @@ def test_everything_else_is_told_by_its_address(server, page_source):
     assert told(server, "/revisions/1.json")["id"] == 1
     assert told(server, "/graph.json") == {"objects": [], "relations": [], "rooms": []}
     assert told(server, "/history.json?at=0,1,2&component=0") == {"rows": []}
-    missing = (f"/scenes/{'e' * 32}/extras.json", "/revisions/2.json", "/changes/c1.jpg", "/merged/0/tileset.json")
+    names = ("revisions/2.json", "changes/c1-after.jpg", "merged/0/tileset.json")
+    missing = (f"/scenes/{'e' * 32}/extras.json", *(f"/{name}" for name in names))
     for path in missing:
         assert ask(server, path)[0] == 404
     for path in ("/history.json?at=here", "/history.json?at=0,1,2&component=x"):

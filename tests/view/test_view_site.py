@@ -43,7 +43,7 @@ def page_source(tmp_path):
     box = np.array([[0.0, 0, 0], [1, 1, 1]])
     change = ViewChange("c3", "moved", 0, box, A, B, None, 0.9, "open")
     found.view = replace(found.view, merged=frozenset([0]), changes=[change], has_objects=True)
-    found.change_picture = lambda name: np.zeros((4, 6, 3), np.uint8)
+    found.change_pictures = lambda name: (np.zeros((4, 6, 3), np.uint8),) * 2
     return found
 
 
@@ -91,7 +91,7 @@ def test_every_address_is_a_file_and_none_is_of_this_machine(page_source, levels
     assert [view["camera"] for view in detail["views"]] == ["one", "two"]
     for view in detail["views"]:
         assert (out / view["difference"]).read_bytes()[:2] == b"\xff\xd8"
-    assert said["changes"][0]["pictures"] == "changes/c3.jpg"
+    assert said["changes"][0]["pictures"] == ["changes/c3-before.jpg", "changes/c3-after.jpg"]
     overview = said["components"][0]["overview"]
     assert len(spz.unpack("o", (out / overview["uri"]).read_bytes())) == sum(overview["counts"])
     assert not (out / "merged" / "0" / "note.txt").exists()

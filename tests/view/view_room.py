@@ -104,7 +104,7 @@ class MadeDoors:
         pictures = tuple(np.full((8, 10, 3), 40 * k, np.uint8) for k in range(2))
         return PairPictures(("one", "two"), pictures, pictures, pictures)
 
-    def change_picture(self, change: str) -> np.ndarray:
+    def change_pictures(self, change: str) -> tuple[np.ndarray, np.ndarray]:
         raise NotFoundError(f"no change {change}")
 
     def graph(self) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import { fits } from "./address";
 import type {
   Actions,
   Box,
+  ChangeEntry,
   FloorPlan,
   GraphEntry,
   MapSummary,
@@ -18,7 +19,7 @@ import type { Resource } from "./resources";
 import { COMPARISONS, page } from "./state";
 import type { Pick } from "./stage/stage";
 import type { Overlay, Selection, Side, State, Tab, Theme, Undo } from "./state";
-import { middleOf, standpointOf } from "./words";
+import { CHANGE_WORDS, middleOf, standpointOf } from "./words";
 
 // ---- what is asked of the server, once --------------------------------------------------------------------------
 
@@ -224,6 +225,12 @@ export function splitPair(a: string, b: string): void {
   });
 }
 
+/** The same of any two scenes of one component, which is shown. */
+export function showPair(a: SceneEntry, b: SceneEntry): void {
+  showComponent(a.component);
+  splitPair(a.id, b.id);
+}
+
 export function clip(on = !page.state.clip): void {
   const { map, component } = page.state;
   const whole = map ? derive.componentOf(map, component)?.box : null;
@@ -389,30 +396,48 @@ export function measure(from?: Pick): void {
   else page.set({ ruler: from ? [from] : [], pick: null });
 }
 
-export const hover = (object: string | null) => {
-  if (object !== page.state.hovered) page.set({ hovered: object });
+/** @param thing id of an object or a change */
+export const hover = (thing: string | null) => {
+  if (thing !== page.state.hovered) page.set({ hovered: thing });
 };
 
-/** The next or previous of the list that is open. */
+/** "Moved in room r2": the kind of a change, and its room once rooms are known. */
+export function titleOfChange({ id, kind }: ChangeEntry): string {
+  const known = graphOf(page.state);
+  const room = known?.status === "ready" ? known.value.changes[id] : undefined;
+  return `${CHANGE_WORDS[kind] ?? kind}${room ? ` in room ${room}` : ""}`;
+}
+
+/** Whether there is a 3D view, or one is being made: without WebGL there is only the floor plan. */
+export const has3D = (state: State) => state.stageError === null;
+
+/** Chooses one of the two captures that are compared. */
+export function choosePair(place: 0 | 1, id: string): void {
+  const [a, b] = page.state.pair;
+  page.set({ pair: place === 0 ? [id, b] : [a, id] });
+}
+
+const OF_TAB = { look: "scene", review: "edge", time: "change", things: "object" } as const;
+
+/** The next or previous of the list that the selection is in; without a selection, of the list that is open. */
 export function step(by: 1 | -1): void {
   const { state } = page;
   const { map } = state;
   if (!map) return;
-  const keys: Selection[] =
-    state.tab === "time"
-      ? derive.listedChanges(state).map((one) => ({ kind: "change", key: one.id }))
-      : state.tab === "look"
-        ? derive.listedScenes(state).map((one) => ({ kind: "scene", key: one.id }))
-        : state.tab === "review"
-          ? derive.listedEdges(state).map((one) => ({ kind: "edge", key: derive.edgeKey(map, one) }))
-          : objectsOf(state)
-              .filter((one) => one.component === state.component)
-              .map((one) => ({ kind: "object", key: one.id }));
+  const kind = state.selection?.kind ?? OF_TAB[state.tab];
+  const listed: Record<Selection["kind"], () => string[]> = {
+    scene: () => derive.listedScenes(state).map((one) => one.id),
+    edge: () => derive.listedEdges(state).map((one) => derive.edgeKey(map, one)),
+    change: () => derive.listedChanges(state).map((one) => one.id),
+    object: () => derive.listedObjects(state, objectsOf(state)).map((one) => one.id),
+    photo: () => derive.listedPhotos(state).map((one) => one.file),
+  };
+  const keys = listed[kind]();
   if (!keys.length) return;
-  const now = keys.findIndex(({ kind, key }) => derive.isSelected(state, kind, key));
+  const now = keys.findIndex((key) => derive.isSelected(state, kind, key));
   const next = now < 0 ? (by > 0 ? 0 : keys.length - 1) : now + by;
-  const found = keys[next];
-  if (found) select(found);
+  const key = keys[next];
+  if (key !== undefined) select({ kind, key });
   else say(by > 0 ? "That was the last one" : "That was the first one");
 }
 

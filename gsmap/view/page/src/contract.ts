@@ -5,6 +5,7 @@
 // same `state`.
 
 export type Vector = [number, number, number];
+export type Vector4 = [number, number, number, number];
 export type Matrix = number[][]; // 4 x 4, [s R | t]
 export type Box = [Vector, Vector]; // lowest and highest corner
 
@@ -137,7 +138,7 @@ export interface ChangeEntry {
   confidence: number;
   status: string; // "open", "confirmed", "rejected"
   note: string; // of the review
-  pictures: string | null; // GET: one picture, before and after beside each other
+  pictures: [string, string] | null; // GET: before and after, from the same camera
 }
 
 export interface PhotoEntry {
@@ -153,6 +154,7 @@ export interface PhotoEntry {
 export interface FloorPlan {
   picture: string | null; // a data address
   size_m: [number, number];
+  P_plan_map: [Vector4, Vector4]; // times (x, y, z, 1) of a point of the map: its position on the plan
   scenes: { scene: number; at: [number, number]; outlines: [number, number][][] }[]; // index into MapSummary.scenes
 }
 
@@ -207,6 +209,7 @@ export interface GraphEntry {
   objects: ObjectEntry[];
   relations: { a: string; b: string; kind: string }[]; // ids; kind: "on", "in", "next to"
   rooms: RoomEntry[];
+  changes: Record<string, string>; // room of each change that lies in one; ids
 }
 
 /** GET of MapSummary.history */

@@ -1,5 +1,16 @@
 // What follows from the state: which scenes are seen, which edges are listed. Pure functions.
-import type { ChangeEntry, Component, EdgeEntry, MapSummary, PhotoEntry, RevisionPoses, SceneEntry } from "./contract";
+import type {
+  ChangeEntry,
+  Component,
+  EdgeEntry,
+  FloorPlan,
+  MapSummary,
+  ObjectEntry,
+  PhotoEntry,
+  RevisionPoses,
+  SceneEntry,
+  Vector,
+} from "./contract";
 import type { Pick } from "./stage/stage";
 import type { EdgeFilter, Selection, Side, State } from "./state";
 
@@ -109,6 +120,59 @@ export function listedChanges(state: State): ChangeEntry[] {
     .filter((one) => one.component === component && isBy(one.at, until) && shown(one))
     .sort((a, b) => (b.at ?? "").localeCompare(a.at ?? "") || b.confidence - a.confidence);
 }
+
+const fits = (query: string, ...texts: (string | null)[]): boolean => {
+  const text = texts.join(" ").toLowerCase();
+  return query
+    .toLowerCase()
+    .split(/\s+/)
+    .every((word) => text.includes(word));
+};
+
+/** Objects of the component that fit every word of the query: in name, label, id, room or date. */
+export const listedObjects = ({ component, thingQuery }: State, objects: readonly ObjectEntry[]): ObjectEntry[] =>
+  objects.filter(
+    (one) => one.component === component && fits(thingQuery, one.name, one.label, one.id, one.room, one.last_seen),
+  );
+
+/** Photos of the component that fit every word of the query: in file name or date. */
+export const listedPhotos = ({ map, component, thingQuery }: State): PhotoEntry[] =>
+  map?.photos.filter((one) => one.component === component && fits(thingQuery, one.file, one.captured_at)) ?? [];
+
+/** What the map knows of two captures: their edge, and their comparison for changes. */
+export interface PairFacts {
+  older: SceneEntry;
+  newer: SceneEntry;
+  edge: EdgeEntry | undefined;
+  changes: ChangeEntry[];
+  isCompared: boolean;
+  isUncompared: boolean; // and the action `compare` would compare them
+}
+
+export function pairFacts({ map, pair: [a, b] }: State): PairFacts | null {
+  const [one, other] = map ? [sceneOf(map, a), sceneOf(map, b)] : [];
+  if (!map || !one || !other || one === other) return null;
+  const isTurned = (one.captured_at ?? "") > (other.captured_at ?? "");
+  const [older, newer] = isTurned ? [other, one] : [one, other];
+  const ends = [map.scenes.indexOf(older), map.scenes.indexOf(newer)];
+  const isThis = (p: number, q: number) => ends.includes(p) && ends.includes(q);
+  return {
+    older,
+    newer,
+    edge: map.edges.find((edge) => isThis(edge.target, edge.source)),
+    changes: map.changes.filter((change) => isThis(change.before, change.after)),
+    isCompared: map.compared.some((pair) => isThis(...pair)),
+    isUncompared: map.uncompared.some((pair) => isThis(...pair)),
+  };
+}
+
+/** Where a point of the map lies on a floor plan, as shares of its width and height from the top left. */
+export const onPlan = ({ P_plan_map: rows }: FloorPlan, [x, y, z]: Vector) =>
+  rows.map(([a, b, c, d]) => a * x + b * y + c * z + d) as [number, number];
+
+/** The changes that are drawn over the map: those of the list, while it or one of them is looked at. */
+export const shownChanges = (state: State) =>
+  state.tab === "time" || state.selection?.kind === "change" ? listedChanges(state) : [];
 
 export interface Length {
   across: number;

@@ -121,9 +121,10 @@ export function drive(stage: Stage): () => void {
         stage.setGraph(known.value);
       }
     }
-    changes.now(state.tab === "time" || state.selection?.kind === "change" ? derive.listedChanges(state) : []);
+    changes.now(derive.shownChanges(state));
     detail.now(detailOf(state));
-    const chosen = state.selection?.kind === "object" ? state.selection.key : null;
+    const { selection } = state;
+    const chosen = selection?.kind === "object" || selection?.kind === "change" ? selection.key : null;
     highlighted.now(new Set([chosen, state.hovered].flatMap((id) => id ?? [])));
     measured.now((state.ruler ?? [state.pick]).flatMap((pick) => (pick?.point ? [pick.point] : [])));
     ruler.now(state.ruler !== null);

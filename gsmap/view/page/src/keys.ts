@@ -76,11 +76,16 @@ export const KEYS: readonly Key[] = [
     press: () => actions.tab(name),
   })),
   { key: "/", what: "Find in the list", group: "Everywhere", press: findBox },
+  {
+    key: "j",
+    what: "Next in the list: edge, change, object, scene, photo",
+    group: "Everywhere",
+    press: () => actions.step(1),
+  },
+  { key: "k", what: "Previous in the list", group: "Everywhere", press: () => actions.step(-1) },
   { key: "p", what: "Fold or open the panel", group: "Everywhere", press: () => actions.fold() },
   { key: "l", what: "Copy a link to this view", group: "Everywhere", press: () => void actions.copyLink() },
   { key: "Escape", shown: "Esc", what: "Close what is chosen", group: "Everywhere", press: escape },
-  { key: "j", what: "Next in the list", group: "Review", press: () => actions.step(1) },
-  { key: "k", what: "Previous in the list", group: "Review", press: () => actions.step(-1) },
   { key: "c", what: "Confirm", group: "Review", press: () => verdict("confirm") },
   { key: "r", what: "Reject", group: "Review", press: () => verdict("reject") },
   { key: "t", what: "Take the review back", group: "Review", press: () => verdict("withdraw") },
@@ -127,6 +132,8 @@ export function listen(): void {
     const found = KEYS.find((one) => one.key === event.key);
     if (!found || page.state.phase !== "ready") return;
     event.preventDefault();
-    found.press();
+    if (found.group === "View" && !actions.has3D(page.state))
+      actions.say("This needs the 3D view, which needs WebGL 2");
+    else found.press();
   });
 }

@@ -76,6 +76,8 @@ export interface State {
   overlays: ReadonlySet<Overlay>;
   selection: Selection | null;
   sceneQuery: string;
+  thingQuery: string; // of objects and photos
+  pair: readonly [string, string]; // ids of the two captures that are chosen for comparison; "" for none
   edgeFilter: EdgeFilter;
   edgeQuery: string;
   changeFilter: ChangeFilter;
@@ -86,7 +88,7 @@ export interface State {
   revision: number | null; // null: the newest
   pick: Pick | null;
   ruler: readonly Pick[] | null; // ends of the measured length that are set: none, one or both; null: put away
-  hovered: string | null; // id of the object in the list that the pointer is on
+  hovered: string | null; // id of the object or change that the pointer is on
   drag: Drag | null;
   standpoint: Standpoint | null;
   busy: string | null; // what the server is doing
@@ -115,6 +117,8 @@ export function initial(): State {
     overlays: new Set(),
     selection: null,
     sceneQuery: "",
+    thingQuery: "",
+    pair: ["", ""],
     edgeFilter: "doubtful",
     edgeQuery: "",
     changeFilter: "open",

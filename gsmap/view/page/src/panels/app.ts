@@ -17,6 +17,7 @@ import "./help";
 import "./labels";
 import "./look";
 import "./notices";
+import "./pair";
 import "./place";
 import "./progress";
 import "./review";

@@ -1,15 +1,16 @@
 // One change: before and after, where and when, and a person's word on it.
 import { css, html, nothing } from "lit";
-import { customElement, state } from "lit/decorators.js";
+import { customElement } from "lit/decorators.js";
 import * as actions from "../actions";
-import { relative } from "../api";
 import * as derive from "../derive";
-import { CHANGE_WORDS, metres, pairText, percent } from "../words";
+import { metres, pairText, percent } from "../words";
 import { Panel } from "./base";
 import { shared } from "./css";
 import { heading } from "./heading";
 import { icon } from "./icons";
+import "./compare";
 import "./kind";
+import { whereItIs } from "./plan";
 import { verdictBelow } from "./verdict";
 
 const STANDS: Record<string, string> = { open: "warn", confirmed: "good", rejected: "bad" };
@@ -21,28 +22,11 @@ export class ChangeDetail extends Panel {
     heading.styles,
     verdictBelow,
     css`
-      img {
-        display: block;
-        width: 100%;
-        height: auto;
-        border-radius: 6px;
-      }
-      figcaption {
-        display: grid;
-        grid-template-columns: 1fr 1fr;
-        gap: 8px;
-        padding-top: 6px;
-        font-size: 0.85rem;
-        color: var(--muted);
-        overflow-wrap: anywhere;
-      }
       gs-verdict {
         margin-top: auto;
       }
     `,
   ];
-
-  @state() private broken: string | null = null;
 
   protected override render() {
     const { state: now } = this;
@@ -52,44 +36,43 @@ export class ChangeDetail extends Panel {
     const [before, after] = [map.scenes[change.before], map.scenes[change.after]];
     const unit = derive.componentOf(map, change.component)?.metres_per_unit ?? 1;
     const sides = change.box[1].map((v, i) => metres((v - (change.box[0][i] ?? v)) * unit));
-    const picture = relative(change.pictures);
-    const isBroken = this.broken === change.id;
     return html`
       ${heading(
-        html`<gs-kind of=${change.kind}></gs-kind> ${CHANGE_WORDS[change.kind] ?? change.kind}`,
+        html`<gs-kind .change=${change}></gs-kind> ${actions.titleOfChange(change)}`,
         html`<span class="mark ${STANDS[change.status] ?? ""}">${change.status}</span>
           <span>confidence ${percent(change.confidence)}</span>
           <span class="anywhere">${pairText(map, change.before, change.after)}</span> <span>${change.id}</span>`,
         true,
       )}
       <div class="body">
-        <section>
-          ${
-            picture && !isBroken
-              ? html`<figure>
-                  <img
-                    src=${picture}
-                    alt="The place before and after, beside each other"
-                    @error=${() => (this.broken = change.id)}
-                  />
-                  <figcaption><span>before: ${before?.name}</span><span>after: ${after?.name}</span></figcaption>
-                </figure>`
-              : html`<p class="empty">
-                  ${isBroken ? "The picture could not be loaded." : "There is no picture of this change."}
-                  ${isBroken ? html`<button @click=${() => (this.broken = null)}>Load it again</button>` : nothing}
-                </p>`
-          }
-        </section>
-        <section class="row">
-          <button @click=${() => actions.flyToSelected()}>${icon("fly")} Fly to it</button>
-          ${
-            before && after
-              ? html`<button @click=${() => actions.splitPair(before.id, after.id)}>
-                  ${icon("split")} Before and after in 3D
-                </button>`
-              : nothing
-          }
-        </section>
+        ${
+          change.pictures
+            ? html`<section>
+                <gs-compare
+                  .first=${change.pictures[0]}
+                  .second=${change.pictures[1]}
+                  .firstName="before: ${before?.name}"
+                  .secondName="after: ${after?.name}"
+                  .mode=${now.comparison}
+                ></gs-compare>
+              </section>`
+            : html`<p class="empty">There are no pictures of this change.</p>`
+        }
+        ${
+          actions.has3D(now)
+            ? html`<section class="row">
+                <button @click=${() => actions.flyToSelected()}>${icon("fly")} Fly to it</button>
+                ${
+                  before && after
+                    ? html`<button @click=${() => actions.splitPair(before.id, after.id)}>
+                        ${icon("split")} Before and after in 3D
+                      </button>`
+                    : nothing
+                }
+              </section>`
+            : nothing
+        }
+        ${whereItIs()}
         <section>
           <dl class="facts">
             <dt>Size of the box</dt>

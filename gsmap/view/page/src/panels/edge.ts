@@ -234,6 +234,7 @@ export class Edge extends Panel {
   }
 
   private inThreeD(detail: EdgeDetail, edge: EdgeEntry, map: MapSummary) {
+    if (!actions.has3D(this.state)) return nothing;
     const [a, b] = [map.scenes[edge.target], map.scenes[edge.source]];
     const isTogether = a && b && a.component === b.component;
     const count = detail.correspondences.length;

@@ -1,5 +1,5 @@
 // The way into the map and out of it; until the 3D view has something to show, the floor plan.
-import { css, html, nothing, svg } from "lit";
+import { css, html, nothing } from "lit";
 import { customElement, state } from "lit/decorators.js";
 import * as actions from "../actions";
 import type { FloorPlan } from "../contract";
@@ -8,8 +8,7 @@ import { page } from "../state";
 import { CanvasPanel } from "./base";
 import { shared } from "./css";
 import { icon } from "./icons";
-
-const WIDTH = 1000; // of the drawing's own units
+import "./plan";
 
 @customElement("gs-entry")
 export class Entry extends CanvasPanel {
@@ -31,7 +30,7 @@ export class Entry extends CanvasPanel {
       }
       figure {
         margin: 0;
-        padding: 48px 64px 24px;
+        padding: 16px 60px 16px 16px;
         min-height: 0;
         display: grid;
         grid-template-rows: minmax(0, 1fr) auto;
@@ -39,29 +38,10 @@ export class Entry extends CanvasPanel {
         background: var(--ground);
         pointer-events: auto;
       }
-      figure svg {
-        width: 100%;
-        height: 100%;
-      }
       figcaption {
         text-align: center;
         color: var(--muted);
-      }
-      .outline {
-        fill: none;
-        stroke: var(--accent);
-        stroke-width: 2.5;
-        opacity: 0.7;
-      }
-      text {
-        font:
-          600 26px system-ui,
-          sans-serif;
-        fill: var(--text);
-        stroke: var(--ground);
-        stroke-width: 6px;
-        paint-order: stroke;
-        text-anchor: middle;
+        text-wrap: pretty;
       }
       @media (max-width: 759px) {
         figure {
@@ -101,26 +81,16 @@ export class Entry extends CanvasPanel {
         </button>`;
   }
 
-  private plan({ picture, size_m: [width, height], scenes }: FloorPlan, error: string | null) {
-    const high = (WIDTH * height) / width;
-    const at = ([x, y]: [number, number]) => `${(WIDTH * x).toFixed(1)} ${(high * y).toFixed(1)}`;
-    const outline = (rings: [number, number][][]) => rings.map((ring) => `M${ring.map(at).join("L")}Z`).join("");
-    const uri = picture?.startsWith("data:image/webp;base64,") ? picture : null;
+  private plan(plan: FloorPlan, error: string | null) {
+    const [width, height] = plan.size_m;
     return html`<figure>
-      <svg viewBox="0 0 ${WIDTH} ${high}" role="img" aria-label="Floor plan of the map">
-        ${uri ? svg`<image href=${uri} width=${WIDTH} height=${high} preserveAspectRatio="none" />` : nothing}
-        ${scenes.map(({ outlines }) => svg`<path class="outline" d=${outline(outlines)} />`)}
-        ${scenes.map(
-          ({ scene, at: [x, y] }) =>
-            svg`<text x=${WIDTH * x} y=${high * y}>${this.state.map?.scenes[scene]?.name ?? ""}</text>`,
-        )}
-      </svg>
+      <gs-plan .plan=${plan}></gs-plan>
       <figcaption role="status">
         Floor plan, ${width.toFixed(0)} × ${height.toFixed(0)} m.
         ${
           error
-            ? html`The 3D view does not work here: ${error} It needs WebGL 2: look whether the browser's hardware
-              acceleration is on. Lists, reviews and pictures work without it.`
+            ? html`The 3D view needs WebGL 2, which does not work here: look whether the browser's hardware acceleration
+                is on. Lists, reviews and pictures work without it. <span class="small">(${error})</span>`
             : "The 3D view is being prepared."
         }
         ${this.isDrawn ? html`<button @click=${actions.stay}>Show what is there of it</button>` : nothing}

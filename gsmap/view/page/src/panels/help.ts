@@ -1,5 +1,5 @@
 // The keys of the page and of the 3D view.
-import { css, html } from "lit";
+import { css, html, nothing } from "lit";
 import type { PropertyValues } from "lit";
 import { customElement } from "lit/decorators.js";
 import * as actions from "../actions";
@@ -73,7 +73,7 @@ export class Help extends Panel {
   ];
 
   protected override render() {
-    const groups = ["Everywhere", "Review", "View"] as const;
+    const groups = ["Everywhere", "Review", ...(actions.has3D(this.state) ? ["View"] : [])];
     return html`<dialog aria-labelledby="title" @close=${() => actions.help(false)} @click=${this.beside}>
       <div class="top">
         <h2 id="title">Keys</h2>
@@ -93,18 +93,22 @@ export class Help extends Panel {
               </dl>
             </div>`,
         )}
-        <div class="group">
-          <h3>In the 3D view, when it has the focus</h3>
-          <dl>
-            ${HAND.map(
-              ([how, what]) =>
-                html`<dt><kbd>${how}</kbd></dt>
-                  <dd>${what}</dd>`,
-            )}
-          </dl>
-        </div>
+        ${actions.has3D(this.state) ? this.hand() : nothing}
       </div>
     </dialog>`;
+  }
+
+  private hand() {
+    return html`<div class="group">
+      <h3>In the 3D view, when it has the focus</h3>
+      <dl>
+        ${HAND.map(
+          ([how, what]) =>
+            html`<dt><kbd>${how}</kbd></dt>
+              <dd>${what}</dd>`,
+        )}
+      </dl>
+    </div>`;
   }
 
   protected override updated(changed: PropertyValues): void {

@@ -1,4 +1,4 @@
-// The colour of a kind of change, as the 3D view draws its boxes.
+// The number of a change on the colour of its kind, as its row, the floor plan and the 3D view show it.
 import { css, html } from "lit";
 import { LitElement } from "lit";
 import { customElement, property } from "lit/decorators.js";
@@ -14,18 +14,23 @@ export class Kind extends LitElement {
     }
     i {
       display: block;
-      width: 0.7em;
-      height: 0.7em;
-      border-radius: 2px;
+      min-width: 1.6em;
+      padding: 0 0.35em;
+      border-radius: 99px;
       background: var(--kind);
+      color: #101418;
+      font:
+        650 0.82rem/1.55 system-ui,
+        sans-serif;
+      font-variant-numeric: tabular-nums;
+      text-align: center;
     }
   `;
 
-  @property() of: ChangeEntry["kind"] = "moved";
+  @property({ attribute: false }) change: ChangeEntry | null = null;
 
   protected override render() {
-    return html`<i
-      ${vars({ "--kind": `#${(CHANGE_COLOURS[this.of] ?? 0x8a8f98).toString(16).padStart(6, "0")}` })}
-    ></i>`;
+    const colour = (this.change && CHANGE_COLOURS[this.change.kind]) ?? 0x8a8f98;
+    return html`<i ${vars({ "--kind": `#${colour.toString(16).padStart(6, "0")}` })}>${this.change?.id.slice(1)}</i>`;
   }
 }

@@ -1,4 +1,4 @@
-// Names of the scenes over the 3D view while the viewer sees them from above.
+// Numbers of changes over the 3D view, and names of the scenes while the viewer sees them from above.
 import { css, html } from "lit";
 import type { PropertyValues } from "lit";
 import { customElement } from "lit/decorators.js";
@@ -7,9 +7,11 @@ import * as actions from "../actions";
 import type { SceneEntry } from "../contract";
 import * as derive from "../derive";
 import { page } from "../state";
+import { middleOf } from "../words";
 import { posesOf } from "../driver";
 import { CanvasPanel } from "./base";
 import { shared } from "./css";
+import "./kind";
 
 const HIGH = 26; // px, of a label and its margin
 const MOST = 200; // of a component that are labelled
@@ -49,8 +51,17 @@ export class Labels extends CanvasPanel {
         border-color: var(--accent);
         color: var(--accent-text);
       }
+      button.change {
+        padding: 2px;
+      }
+      button.change:hover,
+      button.change[aria-pressed="true"] {
+        z-index: 1; /* above others at the same place */
+      }
       @media (max-width: 759px) {
-        button {
+        button,
+        button.change {
+          min-width: 36px;
           min-height: 36px;
         }
       }
@@ -71,6 +82,24 @@ export class Labels extends CanvasPanel {
 
   protected override render() {
     return html`${repeat(
+      derive.shownChanges(this.state).slice(0, MOST),
+      ({ id }) => id,
+      (change) =>
+        html`<button
+          class="change out"
+          data-change=${change.id}
+          tabindex="-1"
+          title="${change.id}: ${actions.titleOfChange(change)}"
+          aria-label="${change.id}: ${actions.titleOfChange(change)}"
+          aria-pressed=${derive.isSelected(this.state, "change", change.id)}
+          @click=${() => actions.select({ kind: "change", key: change.id })}
+          @pointerenter=${() => actions.hover(change.id)}
+          @pointerleave=${() => actions.hover(null)}
+        >
+          <gs-kind .change=${change}></gs-kind>
+        </button>`,
+    )}
+    ${repeat(
       this.scenes(),
       ({ scene }) => scene.id,
       ({ scene }) =>
@@ -97,9 +126,12 @@ export class Labels extends CanvasPanel {
     const { stage } = page;
     const taken: { x: number; y: number; half: number }[] = [];
     const scenes = new Map(this.scenes().map(({ scene }) => [scene.id, scene]));
+    const changes = new Map(derive.shownChanges(this.state).map((change) => [change.id, change]));
     for (const button of this.renderRoot.querySelectorAll<HTMLElement>("button")) {
+      const change = changes.get(button.dataset["change"] ?? "");
       const scene = scenes.get(button.dataset["id"] ?? "");
-      const at = scene && stage?.state.isShown && stage.state.isAbove ? stage.project(scene.middle) : null;
+      const point = change ? middleOf(change.box) : stage?.state.isAbove ? scene?.middle : undefined;
+      const at = point && stage?.state.isShown ? stage.project(point) : null;
       const half = button.offsetWidth / 2 + 4;
       const isFree =
         at &&
@@ -107,7 +139,8 @@ export class Labels extends CanvasPanel {
         at[0] < this.clientWidth - half &&
         at[1] > HIGH &&
         at[1] < this.clientHeight - HIGH &&
-        taken.every(({ x, y, half: other }) => Math.abs(x - at[0]) > half + other || Math.abs(y - at[1]) > HIGH);
+        (change !== undefined ||
+          taken.every(({ x, y, half: other }) => Math.abs(x - at[0]) > half + other || Math.abs(y - at[1]) > HIGH));
       button.classList.toggle("out", !isFree);
       if (!at || !isFree) continue;
       taken.push({ x: at[0], y: at[1], half });

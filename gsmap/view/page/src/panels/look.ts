@@ -89,22 +89,25 @@ export class Look extends Panel {
         ${this.componentChoice(map.components)} ${component ? this.facts(component) : nothing}
       </section>
       ${state.split || component?.merged ? this.sources(component) : nothing}
-      ${state.clip ? html`<gs-clip></gs-clip>` : nothing}
-      <fieldset class="overlays">
-        <legend>Drawn over the map</legend>
-        ${OVERLAYS.map(
-          (name) =>
-            html`<label
-              ><input
-                type="checkbox"
-                .checked=${state.overlays.has(name)}
-                @change=${() => actions.overlay(name)}
-              />${OVERLAY_NAMES[name]}</label
-            >`,
-        )}
-      </fieldset>
+      ${state.clip ? html`<gs-clip></gs-clip>` : nothing} ${actions.has3D(state) ? this.overlays() : nothing}
       <gs-scene-list></gs-scene-list>
     `;
+  }
+
+  private overlays() {
+    return html`<fieldset class="overlays">
+      <legend>Drawn over the map</legend>
+      ${OVERLAYS.map(
+        (name) =>
+          html`<label
+            ><input
+              type="checkbox"
+              .checked=${this.state.overlays.has(name)}
+              @change=${() => actions.overlay(name)}
+            />${OVERLAY_NAMES[name]}</label
+          >`,
+      )}
+    </fieldset>`;
   }
 
   private componentChoice(components: readonly Component[]) {

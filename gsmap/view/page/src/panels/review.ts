@@ -57,7 +57,7 @@ export class Review extends Panel {
     css`
       :host {
         display: grid;
-        grid-template-rows: auto auto minmax(0, 1fr) auto;
+        grid-template-rows: auto auto auto minmax(0, 1fr) auto;
         gap: 10px;
       }
       gs-listing {
@@ -100,6 +100,7 @@ export class Review extends Panel {
     const edges = derive.listedEdges(state);
     const chosen = state.selection?.kind === "edge" ? state.selection.key : null;
     return html`
+      <gs-pair></gs-pair>
       <div class="chips" role="group" aria-label="Which edges">
         ${EDGE_FILTERS.map(
           (name) =>

@@ -60,13 +60,17 @@ export class SceneDetail extends Panel {
     return html`
       ${heading(scene.name, html`<span class="mark ${MARKS[scene.status] ?? "hollow"}">${scene.status}</span>`, true)}
       <div class="body">
-        <section class="row">
-          <button @click=${() => actions.flyToSelected()}>${icon("fly")} Fly to it</button>
-          <button @click=${() => actions.solo(scene.id)}>${icon("solo")} Only this</button>
-          <button @click=${() => actions.toggleScene(scene.id)}>
-            ${icon(isHidden ? "eye" : "hidden")} ${isHidden ? "Show" : "Hide"}
-          </button>
-        </section>
+        ${
+          actions.has3D(state)
+            ? html`<section class="row">
+                <button @click=${() => actions.flyToSelected()}>${icon("fly")} Fly to it</button>
+                <button @click=${() => actions.solo(scene.id)}>${icon("solo")} Only this</button>
+                <button @click=${() => actions.toggleScene(scene.id)}>
+                  ${icon(isHidden ? "eye" : "hidden")} ${isHidden ? "Show" : "Hide"}
+                </button>
+              </section>`
+            : nothing
+        }
         ${state.drag?.scene === scene.id ? this.dragging(state.drag, scene, unit) : this.prior(scene)}
         <section>
           <dl class="facts">
@@ -99,9 +103,13 @@ export class SceneDetail extends Panel {
     const { state } = this;
     if (!actions.mayAct(state)) return nothing;
     return html`<section class="row">
-      <button ?disabled=${state.busy !== null} @click=${() => actions.startDrag(scene.id)}>
-        ${icon("move")} Move by hand
-      </button>
+      ${
+        actions.has3D(state)
+          ? html`<button ?disabled=${state.busy !== null} @click=${() => actions.startDrag(scene.id)}>
+              ${icon("move")} Move by hand
+            </button>`
+          : nothing
+      }
       ${
         scene.prior
           ? html`<button

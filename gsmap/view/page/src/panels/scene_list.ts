@@ -49,13 +49,18 @@ export class SceneList extends Panel {
       />
       <div class="row spread">
         <span class="muted small" role="status"
-          >${scenes.length === all.length ? plural(all.length, "scene") : `${scenes.length} of ${all.length}`},
-          ${shown === all.length ? "all shown" : `${shown} shown`}</span
+          >${scenes.length === all.length ? plural(all.length, "scene") : `${scenes.length} of ${all.length}`}${
+            !actions.has3D(state) ? nothing : shown === all.length ? ", all shown" : `, ${shown} shown`
+          }</span
         >
-        <span class="row">
-          <button class="plain" ?disabled=${shown === all.length} @click=${actions.showAll}>Show all</button>
-          <button class="plain" ?disabled=${shown === 0} @click=${actions.hideAll}>Hide all</button>
-        </span>
+        ${
+          actions.has3D(state)
+            ? html`<span class="row">
+                <button class="plain" ?disabled=${shown === all.length} @click=${actions.showAll}>Show all</button>
+                <button class="plain" ?disabled=${shown === 0} @click=${actions.hideAll}>Hide all</button>
+              </span>`
+            : nothing
+        }
       </div>
       ${
         scenes.length
@@ -78,14 +83,25 @@ export class SceneList extends Panel {
     const { state } = this;
     const isHidden = actions.sideNow(state).hidden.has(scene.id);
     const isLate = !derive.isBy(scene.captured_at, state.until);
+    const show = html`<span role="gridcell"
+      ><input
+        type="checkbox"
+        aria-label="Show ${scene.name}"
+        .checked=${!isHidden}
+        @change=${() => actions.toggleScene(scene.id)}
+    /></span>`;
+    const only = html`<span role="gridcell"
+      ><button
+        class="plain square"
+        title="Only this scene"
+        aria-label="Only ${scene.name}"
+        @click=${() => actions.solo(scene.id)}
+      >
+        ${icon("solo")}
+      </button></span
+    >`;
     return html`
-      <span role="gridcell"
-        ><input
-          type="checkbox"
-          aria-label="Show ${scene.name}"
-          .checked=${!isHidden}
-          @change=${() => actions.toggleScene(scene.id)}
-      /></span>
+      ${actions.has3D(state) ? show : nothing}
       <span role="gridcell" class="wide ${isHidden || isLate ? "off" : ""}"
         ><button class="choose" title=${scene.name} @click=${() => actions.select({ kind: "scene", key: scene.id })}>
           <span class="name">${scene.name}</span>
@@ -96,16 +112,7 @@ export class SceneList extends Panel {
           >
         </button></span
       >
-      <span role="gridcell"
-        ><button
-          class="plain square"
-          title="Only this scene"
-          aria-label="Only ${scene.name}"
-          @click=${() => actions.solo(scene.id)}
-        >
-          ${icon("solo")}
-        </button></span
-      >
+      ${actions.has3D(state) ? only : nothing}
     `;
   };
 }

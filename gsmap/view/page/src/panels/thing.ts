@@ -10,6 +10,7 @@ import { Panel } from "./base";
 import { shared } from "./css";
 import { heading } from "./heading";
 import { icon } from "./icons";
+import { whereItIs } from "./plan";
 import { waiting } from "./waiting";
 import type { Vector } from "../contract";
 
@@ -24,6 +25,9 @@ export class Thing extends Panel {
         width: 100%;
         border-radius: 6px;
         background: #000;
+      }
+      .picture + section {
+        margin-top: 18px;
       }
       form input {
         min-width: 0;
@@ -67,13 +71,18 @@ export class Thing extends Panel {
     const relations = graph.relations.filter(({ a, b }) => a === one.id || b === one.id);
     const sides = one.box[1].map((v, i) => metres((v - (one.box[0][i] ?? v)) * unit));
     return html`
-      ${heading(titleOf(one), html`<span class="mark ${one.present ? "good" : "hollow"}">${one.present ? "there" : "gone"}</span> <span>${one.id}</span>`)}
+      ${heading(titleOf(one), html`<span class="mark ${one.present ? "good" : "hollow"}">${one.present ? "there" : "gone"}</span> <span>${one.id}</span>`, true)}
       <div class="body">
         ${picture ? html`<img class="picture" src=${picture} alt="Picture of ${titleOf(one)}" />` : nothing}
         <section class="row">
           ${actions.mayAct(this.state) ? this.naming(one) : nothing}
-          <button @click=${() => actions.flyToSelected()}>${icon("fly")} Fly to it</button>
+          ${
+            actions.has3D(this.state)
+              ? html`<button @click=${() => actions.flyToSelected()}>${icon("fly")} Fly to it</button>`
+              : nothing
+          }
         </section>
+        ${whereItIs()}
         <section>
           <dl class="facts">
             <dt>At</dt>
@@ -137,11 +146,17 @@ export class Thing extends Panel {
     const wide = (2 * Math.atan(one.size[0] / (2 * fx)) * 180) / Math.PI;
     const at = [0, 1, 2].map((r) => one.T_map_camera[r]?.[3] ?? 0) as Vector;
     return html`
-      ${heading(one.file, "photograph, localised")}
+      ${heading(one.file, "photograph, localised", true)}
       <div class="body">
-        <section class="row">
-          <button class="main" @click=${() => actions.flyToSelected()}>${icon("fly")} Stand where it was taken</button>
-        </section>
+        ${
+          actions.has3D(this.state)
+            ? html`<section class="row">
+                <button class="main" @click=${() => actions.flyToSelected()}>
+                  ${icon("fly")} Stand where it was taken
+                </button>
+              </section>`
+            : nothing
+        }
         <section>
           <dl class="facts">
             <dt>Taken at</dt>

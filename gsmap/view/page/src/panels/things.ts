@@ -37,7 +37,6 @@ export class Things extends Panel {
   ];
 
   @state() private kind: "objects" | "photos" = "objects";
-  @state() private query = "";
 
   protected override render() {
     const { map, component } = this.state;
@@ -56,19 +55,11 @@ export class Things extends Panel {
         type="search"
         aria-label="Find by name"
         placeholder=${this.kind === "objects" ? "Find an object by name or room" : "Find a photo by file or date"}
-        .value=${this.query}
-        @input=${(event: Event) => (this.query = (event.target as HTMLInputElement).value)}
+        .value=${this.state.thingQuery}
+        @input=${(event: Event) => page.set({ thingQuery: (event.target as HTMLInputElement).value })}
       />
       ${this.kind === "photos" ? this.photos(photos) : this.objects()}
     `;
-  }
-
-  private fits(...texts: (string | null)[]): boolean {
-    const text = texts.join(" ").toLowerCase();
-    return this.query
-      .toLowerCase()
-      .split(/\s+/)
-      .every((word) => text.includes(word));
   }
 
   private objects() {
@@ -83,10 +74,7 @@ export class Things extends Panel {
       "Loading the objects",
       () => actions.graphs.forget(),
       ({ objects }) => {
-        const listed = objects.filter(
-          (one) =>
-            one.component === this.state.component && this.fits(one.name, one.label, one.id, one.room, one.last_seen),
-        );
+        const listed = derive.listedObjects(this.state, objects);
         return listed.length
           ? this.list("Objects", listed, (one) => one.id, this.object, "object")
           : html`<p class="empty">No object of this component fits.</p>`;
@@ -97,10 +85,10 @@ export class Things extends Panel {
   private photos(photos: readonly PhotoEntry[]) {
     if (!photos.length)
       return html`<p class="empty">No photos were localised here: <kbd>gsmap localize MAP photos/</kbd> does that.</p>`;
-    const listed = photos.filter((one) => this.fits(one.file, one.captured_at));
+    const listed = derive.listedPhotos(this.state);
     return listed.length
       ? this.list("Photos", listed, (one) => one.file, this.photo, "photo")
-      : html`<p class="empty">No photo fits “${this.query}”.</p>`;
+      : html`<p class="empty">No photo fits “${this.state.thingQuery}”.</p>`;
   }
 
   private list<T>(

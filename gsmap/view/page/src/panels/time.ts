@@ -6,7 +6,7 @@ import type { ChangeEntry, MapSummary, SceneEntry } from "../contract";
 import * as derive from "../derive";
 import { CHANGE_FILTERS, page } from "../state";
 import type { ChangeFilter } from "../state";
-import { CHANGE_WORDS, day, moment, pairText, percent, plural } from "../words";
+import { day, moment, pairText, percent, plural } from "../words";
 import { Panel } from "./base";
 import { shared } from "./css";
 import { icon } from "./icons";
@@ -58,7 +58,9 @@ export class Time extends Panel {
 
   protected override render() {
     if (!this.state.map) return nothing;
-    return html`${this.changes()} ${this.dates()} ${this.revisions()}`;
+    return html`${this.changes()}
+      <section><gs-pair></gs-pair></section>
+      ${this.dates()} ${actions.has3D(this.state) ? this.revisions() : nothing}`;
   }
 
   private dates() {
@@ -268,10 +270,15 @@ export class Time extends Panel {
   private readonly row = (change: ChangeEntry) => {
     const { map } = this.state;
     const [before, after] = [map?.scenes[change.before], map?.scenes[change.after]];
-    return html`<span role="gridcell" class="wide"
+    return html`<span
+      role="gridcell"
+      class="wide"
+      @pointerenter=${() => actions.hover(change.id)}
+      @pointerleave=${() => actions.hover(null)}
       ><button class="choose" @click=${() => actions.select({ kind: "change", key: change.id })}>
         <span class="name"
-          ><gs-kind of=${change.kind}></gs-kind> ${CHANGE_WORDS[change.kind] ?? change.kind}
+          ><gs-kind .change=${change}></gs-kind>
+          ${actions.titleOfChange(change)}
           <span class="muted"
             >${percent(change.confidence)}${change.status === "open" ? nothing : `, ${change.status}`}</span
           ></span

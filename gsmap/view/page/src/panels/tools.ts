@@ -40,19 +40,24 @@ export class Tools extends Panel {
   protected override render() {
     const { state } = this;
     return html`
-      <div role="toolbar" aria-label="View" aria-orientation="vertical" @keydown=${this.arrows}>
-        ${this.button("fit", "Fit all in view", "f", actions.fit)}
-        ${this.button("house", "Doll’s house: no ceiling", "h", () => actions.ceiling(), !state.ceiling)}
-        ${this.button("ruler", "Measure a length", "m", () => actions.measure(), state.ruler !== null)}
-        ${this.button("clip", "Clip box", "x", () => actions.clip(), state.clip !== null)}
-        ${this.button("split", "Split view", "v", () => actions.split(), state.split !== null)}
-      </div>
+      ${actions.has3D(state) ? this.view() : nothing}
       <div role="toolbar" aria-label="Page" aria-orientation="vertical" @keydown=${this.arrows}>
         ${this.button("link", "Copy a link to this view", "l", () => void actions.copyLink())}
         ${this.button("theme", `Colours: ${state.theme}`, "", () => actions.theme(NEXT[state.theme]))}
         ${this.button("help", "Keys and help", "?", () => actions.help(true))}
       </div>
     `;
+  }
+
+  private view() {
+    const { state } = this;
+    return html`<div role="toolbar" aria-label="View" aria-orientation="vertical" @keydown=${this.arrows}>
+      ${this.button("fit", "Fit all in view", "f", actions.fit)}
+      ${this.button("house", "Doll’s house: no ceiling", "h", () => actions.ceiling(), !state.ceiling)}
+      ${this.button("ruler", "Measure a length", "m", () => actions.measure(), state.ruler !== null)}
+      ${this.button("clip", "Clip box", "x", () => actions.clip(), state.clip !== null)}
+      ${this.button("split", "Split view", "v", () => actions.split(), state.split !== null)}
+    </div>`;
   }
 
   private button(name: Icon, label: string, key: string, press: () => void, pressed?: boolean) {

@@ -84,7 +84,7 @@ class View3D implements Stage {
   private isCeilingShown = true;
   private gizmos: { handle: Object3D; controls: TransformControls[] } | null = null;
   private readonly shownOverlays = new Set<Overlay>();
-  private graph: GraphEntry = { objects: [], relations: [], rooms: [] };
+  private graph: GraphEntry = { objects: [], relations: [], rooms: [], changes: {} };
   private highlighted: ReadonlySet<string> = new Set();
   private measured: readonly Vector[] = [];
   private isRulerTaken = false;
@@ -194,8 +194,8 @@ class View3D implements Stage {
     this.drawOverlays();
   }
 
-  setHighlighted(objects: ReadonlySet<string>): void {
-    this.highlighted = objects;
+  setHighlighted(things: ReadonlySet<string>): void {
+    this.highlighted = things;
     this.drawOverlays();
   }
 
@@ -667,16 +667,15 @@ class View3D implements Stage {
         : [],
       2,
     );
-    overlays.set(
-      "changes",
+    const boxes = (isBold: boolean) =>
       this.changes.flatMap((change) => {
-        if (!isHere(change.component)) return [];
+        if (!isHere(change.component) || this.highlighted.has(change.id) !== isBold) return [];
         const index = map.changes.findIndex((one) => one.id === change.id);
         const thing = { kind: "change" as const, index };
         return [{ points: boxLines(change.box), colour: CHANGE_COLOURS[change.kind], thing }];
-      }),
-      2.5,
-    );
+      });
+    overlays.set("changes", boxes(false), 2);
+    overlays.set("highlighted changes", boxes(true), 5);
     overlays.set(
       "correspondences",
       this.detail

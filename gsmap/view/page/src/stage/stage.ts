@@ -57,8 +57,8 @@ export interface Stage {
   setCeiling(shown: boolean): void;
   setOverlay(name: Overlay, shown: boolean): void;
   setGraph(graph: GraphEntry): void; // of the objects
-  /** Objects whose boxes and relations are drawn, whatever else is; by their ids. */
-  setHighlighted(objects: ReadonlySet<string>): void;
+  /** Objects whose boxes and relations are drawn, whatever else is, and changes whose boxes stand out; by their ids. */
+  setHighlighted(things: ReadonlySet<string>): void;
   /** A length that is measured, or a place that was picked. */
   setMeasure(points: readonly Vector[]): void;
   /** While a length is measured, lines are not picked: its ends are on surfaces. */
