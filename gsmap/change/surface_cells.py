@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from gsmap._native import beyond_ranges
 from gsmap.change.poses import tints
 from gsmap.compare import CaptureViews, ComparedView, Observations, View, count_looks_at
-from gsmap.compare.colours import FLOOR, Balance, log_colours
+from gsmap.compare.colours import FLOOR, Balance, largest_channel, log_colours
 from gsmap.compare.structure import normals_of
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.sh import rgb_of_sh0
@@ -199,21 +199,23 @@ def _colour(a: np.ndarray, b: np.ndarray, line: Balance, limits: tuple[float, fl
     """
     log_a = log_colours(a) * line.slope.astype(np.float32) + line.offset.astype(np.float32)
     log_b = log_colours(b)
-    bright = np.minimum(np.exp(np.maximum(log_a.max(-1), log_b.max(-1))), 1)
+    bright = np.minimum(np.exp(largest_channel(np.maximum(log_a, log_b))), 1)
     plain = _opponent(log_b - log_a, bright)
     # Texture that is shifted by a pixel, or blurred in one capture, stays within the other capture's range around the
     # pixel.
     strengths = []
     for x, y in ((log_a, log_b), (log_b, log_a)):
         beyond = _opponent(beyond_ranges(x, y), bright)
-        strengths.append(np.maximum(np.abs(beyond[..., :2]).max(-1) / limits[0], np.abs(beyond[..., 2]) / limits[1]))
+        red, blue, lightness = np.moveaxis(np.abs(beyond), -1, 0)
+        strengths.append(np.maximum(np.maximum(red, blue) / limits[0], lightness / limits[1]))
     return plain, np.minimum(*strengths)
 
 
 def _opponent(ratio: np.ndarray, bright: np.ndarray) -> np.ndarray:
     """Return red and blue relative to green, and the mean of all three, as in `gsmap.compare.Balance.differences`."""
     green = ratio[..., 1]
-    parts = [ratio[..., 0] - green, ratio[..., 2] - green, ratio.mean(-1)]
+    mean = (ratio[..., 0] + green + ratio[..., 2]) / np.float32(3)  # far faster than ``mean`` along short rows
+    parts = [ratio[..., 0] - green, ratio[..., 2] - green, mean]
     return np.stack(parts, axis=-1) * bright[..., None]
 
 

@@ -112,9 +112,10 @@ def render_views(
     for view, at in zip(views, placed, strict=True):
         margin = MIN_TOLERANCE_M
         on = (at.z > view.near[at.row, at.column] - margin) & (at.z < view.far[at.row, at.column] + margin)
-        times_seen[at.index[on]] += 1
-        directions[at.index[on]] |= _direction_bits(scene.gaussians.means[at.index[on]], view)
-        sharpness[at.index[on]] += view.pixels_a_metre(at.z[on]) ** 2
+        rows = at.index[on]
+        times_seen[rows] += 1
+        directions[rows] |= _direction_bits(scene.gaussians.means.take(rows, axis=0), view)
+        sharpness[rows] += view.pixels_a_metre(at.z[on]) ** 2
     well = max_per_cell(scene.gaussians.means, times_seen, CELL_M) >= MIN_VIEWS
     well |= not views
     sure = tuple(v.solid & well[v.dominant_id] & (v.dominant_id >= 0) for v in views) if count else ()
@@ -140,8 +141,8 @@ def observed_from(points: np.ndarray, directions: np.ndarray, view: View) -> np.
 def _direction_bits(points: np.ndarray, view: View) -> np.ndarray:
     """Return the (N,) uint32 bits of all `DIRECTIONS` near that of the view from points (N, 3)."""
     near = _rays(points, view) @ DIRECTIONS.T > _MIN_COSINE
-    out: np.ndarray = (near @ (1 << np.arange(len(DIRECTIONS)))).astype(np.uint32)
-    return out
+    bits: np.ndarray = np.packbits(np.pad(near, ((0, 0), (0, 32 - len(DIRECTIONS)))), axis=1, bitorder="little")
+    return bits.view("<u4")[:, 0].astype(np.uint32, copy=False)
 
 
 def _rays(points: np.ndarray, view: View) -> np.ndarray:
@@ -193,7 +194,8 @@ def _project_visible(points: np.ndarray, view: View, index: ChunkIndex) -> Proje
     lens, (width, height) = camera.intrinsics_px[0], camera.sizes_px[0].tolist()
     ranges = index.visible_ranges(camera.T_camera_frame[0], lens, width, height)
     rows = np.concatenate([np.zeros(0, np.int64), *(np.arange(start, stop) for start, stop in ranges)])
-    at = project_points(points[rows], view, NEAREST_M)
+    visible = np.concatenate([points[:0], *(points[start:stop] for start, stop in ranges)])
+    at = project_points(visible, view, NEAREST_M)
     return replace(at, index=rows[at.index].astype(at.index.dtype))
 
 

@@ -69,7 +69,7 @@ class Balance:
         """Return the differences between single colours (K, 3): chroma (K, 2) and lightness (K,)."""
         log_a, log_b = (np.log(np.clip(v, 0, 1) + np.float32(FLOOR)) for v in (a, b))
         log_a = log_a * self.slope + self.offset
-        bright = np.minimum(np.exp(_largest(np.maximum(log_a, log_b))), 1)
+        bright = np.minimum(np.exp(largest_channel(np.maximum(log_a, log_b))), 1)
         red, blue, light = ((y - x) * bright for x, y in zip(_tones(log_a), _tones(log_b), strict=True))
         return np.stack([red, blue], axis=-1), light
 
@@ -80,8 +80,8 @@ def log_colours(colour: np.ndarray) -> np.ndarray:
     return out
 
 
-def _largest(values: np.ndarray) -> np.ndarray:
-    """Return the (...,) largest of three channels (..., 3)."""
+def largest_channel(values: np.ndarray) -> np.ndarray:
+    """Return the (...,) largest of three channels (..., 3), far faster than ``max`` along short rows."""
     out: np.ndarray = np.maximum(np.maximum(values[..., 0], values[..., 1]), values[..., 2])
     return out
 

@@ -50,10 +50,11 @@ def planes(points: np.ndarray, normals: np.ndarray, cell_m: float) -> np.ndarray
     upright = np.flatnonzero(np.abs(normals[:, 2]) < 0.3)
     for yaw in _directions(normals[upright]):
         way = np.array([np.cos(yaw), np.sin(yaw), 0.0])
-        along = np.abs(normals[upright] @ way) > 0.94
+        distance, cosine = points @ way, np.abs(normals @ way)
+        along = cosine[upright] > 0.94
         faces: list[float] = []
-        for offset in _peaks(points[upright[along]] @ way, _WALL_M2 / cell_m**2):
-            on = (np.abs(points @ way - offset) < _THICK_M) & (np.abs(normals @ way) > 0.8) & (label < 0)
+        for offset in _peaks(distance[upright[along]], _WALL_M2 / cell_m**2):
+            on = (np.abs(distance - offset) < _THICK_M) & (cosine > 0.8) & (label < 0)
             # The other face of a wall need not be seen up to the ceiling, because no other object of that height is so
             # thin.
             thin = any(abs(offset - face) < _THROUGH_M for face in faces)
