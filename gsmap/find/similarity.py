@@ -85,13 +85,14 @@ def describe_samples(points: np.ndarray, lab: np.ndarray, floor_m: float) -> Seg
     """Describe a segment by samples (K, 3) in metres, z up, with CIE Lab colours (K, 3); ``floor_m`` is the height of
     the floor."""
     lab = lab.astype(np.float64)
-    foot = float(np.percentile(points[:, 2], 2))
+    foot = float(_percentiles(points[:, 2], 2)[0])
     height = points[:, 2] - foot
-    top = float(np.percentile(height, 98))
+    top = float(_percentiles(height, 98)[0])
     flat = points[:, :2] - points[:, :2].mean(0)
     axes = np.linalg.eigh(flat.T @ flat)[1][:, ::-1]
     along = flat @ axes
-    length, width = np.percentile(along, 98, axis=0) - np.percentile(along, 2, axis=0)
+    low, high = _percentiles(along, 2, 98)
+    length, width = high - low
     sizes = np.log([max(v, _MIN_SIZE_M) for v in (top, length, width)])
     return SegmentDescriptor(
         sizes,
@@ -100,9 +101,21 @@ def describe_samples(points: np.ndarray, lab: np.ndarray, floor_m: float) -> Seg
         _hue_histogram(lab),
         _tint_histogram(lab),
         float(lab[:, 0].mean()),
-        np.ptp(np.percentile(lab, [10, 90], axis=0), axis=0),
+        np.ptp(_percentiles(lab, 10, 90), axis=0),
         max(0.0, foot - floor_m),
     )
+
+
+def _percentiles(values: np.ndarray, *percents: float) -> np.ndarray:
+    """Return percentiles of values (K, ...) along their first axis; `numpy.percentile` takes ten times as long for few
+    values."""
+    ordered = np.sort(values, axis=0)
+    at = np.array(percents, np.float64) / 100 * (len(values) - 1)
+    low = at.astype(int)
+    share = (at - low).reshape(-1, *[1] * (values.ndim - 1))
+    below, above = ordered[low], ordered[np.minimum(low + 1, len(values) - 1)]
+    out: np.ndarray = np.where(share < 0.5, below + (above - below) * share, above - (above - below) * (1 - share))
+    return out
 
 
 def differences(a: SegmentDescriptor, others: Sequence[SegmentDescriptor]) -> np.ndarray:

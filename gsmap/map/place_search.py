@@ -80,7 +80,7 @@ class _SearchIndex:
             alone.
         num_described: number of graphs of that recipe.
         poses, scenes: poses and scenes of all placed scenes.
-        known: the objects of these graphs.
+        known: the objects of these graphs; those of the map, if these are the newest graphs.
         notes: remarks on the choice of the recipe.
     """
 
@@ -114,7 +114,7 @@ def find_places(
 ) -> tuple[FindReport, list[np.ndarray]]:
     """Find the places of a map that match a query, best first, and a box (2, 3) around each, map frame and unit.
 
-    Nothing is written. Every capture that answers was described by one recipe: while a map moves to another embedder,
+    Every capture that answers was described by one recipe: while a map moves to another embedder,
     the old one answers until it has been described anew as a whole; words and pictures are asked of the present one.
     Words that people gave objects as names or labels are answered by these, and no embedder is asked.
 
@@ -254,7 +254,8 @@ def _index(store: Store, settings: Settings, progress: StageProgress, *, present
     with store.located():
         graphs = {scene: store.graphs.load(scene, key) for scene, key in keys_of.items()}
     there = {scene: graph for scene, graph in graphs.items() if graph is not None}
-    known = compute_objects(store, settings, progress, there)
+    newest = {graph.scene: graph.key for graph in store.graphs.list() if graph.scene in scenes}
+    known = compute_objects(store, settings, progress, None if keys_of == newest else there)
     num_described = len(there.keys() & made[recipe].keys())
     return _SearchIndex(recipe, _embedder(store, recipe), there, num_described, poses, scenes, known, tuple(notes))
 

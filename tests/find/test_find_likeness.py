@@ -13,7 +13,7 @@ from gsmap.find import (
     describe_samples,
     rank_by_similarity,
 )
-from gsmap.find.similarity import DIFFERENCES, _pair_distances, differences
+from gsmap.find.similarity import DIFFERENCES, _pair_distances, _percentiles, differences
 from gsmap.geometry.rotations import exp_so3
 
 
@@ -99,6 +99,13 @@ def test_distances_are_of_all_pairs_or_of_an_even_share() -> None:
     assert len(_pair_distances(many)) == 4000
     assert _pair_distances(many).mean() == pytest.approx(np.linalg.norm(many[:, None] - many, axis=2).mean(), rel=0.03)
     assert _pair_distances(points[:1]).tolist() == [0]
+
+
+def test_percentiles_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(4)
+    for count in (1, 2, 3, 40, 41):
+        values = rng.normal(size=(count, 3))
+        assert np.array_equal(_percentiles(values, 2, 50, 98), np.percentile(values, [2, 50, 98], axis=0))
 
 
 def test_cosines_are_over_what_is_told() -> None:

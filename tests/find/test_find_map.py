@@ -14,6 +14,7 @@ import gsmap
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.map import Map
 from gsmap.map.comparison_pictures import PictureFolder
+from gsmap.map.stages import component_objects
 from gsmap.types.rows.find import FindHit, FindReport
 from tools.make.tiny_encoder import image_encoder
 from tools.make.tiny_text import text_tower, tokenizer
@@ -46,6 +47,14 @@ def test_a_point_finds_what_stands_there_and_its_twins(site: Map) -> None:
         np.testing.assert_allclose(hit.position, hit.position_m)
         assert hit.scene_name in FRAMES
         assert hit.picture is None
+
+
+def test_only_objects_that_the_map_lists_are_found(site: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+    listed = {thing.id for thing in site.objects().objects}
+    monkeypatch.setattr(component_objects, "update_objects", None)  # nothing is computed anew
+    hits = site.find(like=min(listed), top=100).hits
+    assert {hit.object for hit in hits} <= listed
+    assert len(hits) > 4
 
 
 def test_an_object_and_a_node_find_the_same(site: Map) -> None:
