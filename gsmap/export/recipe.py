@@ -61,7 +61,7 @@ class TileRecipe:
         uncompressed: whether the content of ``3dtiles`` is float32 rather than SPZ.
         dates: capture date of each scene, by scene id, if the merger uses dates; None if it does not.
         without: digest of the Gaussians of each scene that are left out, by scene id, if any.
-        unchanged: digest of the places of each scene where its changes were rejected, by scene id, if any.
+        unchanged: digest of the places near a tile where changes were rejected, by its component and name, if any.
         photos: digest of the photos that a tile is fitted to, by its component and name, if any.
         up: vertical axis of the files: ``z``, that of the map, or ``y``, as viewers of the format expect it
             (`upright`); None takes the format's default (`default_up`).
@@ -77,7 +77,7 @@ class TileRecipe:
     uncompressed: bool = False
     dates: Mapping[str, str | None] | None = None
     without: Mapping[str, str] = field(default_factory=dict)
-    unchanged: Mapping[str, str] = field(default_factory=dict)
+    unchanged: Mapping[tuple[int, str], str] = field(default_factory=dict)
     photos: Mapping[tuple[int, str], str] = field(default_factory=dict)
     up: str | None = "z"
 
@@ -155,7 +155,8 @@ class TileRecipe:
         if self.dates is not None:
             inputs += [f"captured_at {scene} {self.dates.get(scene)}" for scene in scenes]
         inputs += [f"without {scene} {self.without[scene]}" for scene in scenes if self.without.get(scene)]
-        inputs += [f"unchanged {scene} {self.unchanged[scene]}" for scene in scenes if self.unchanged.get(scene)]
+        if unchanged := self.unchanged.get((planned.component, planned.name)):
+            inputs.append(f"unchanged {unchanged}")
         if photos := self.photos.get((planned.component, planned.name)):
             inputs.append(f"photos {photos}")
         return inputs

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from gsmap.map.static_filter import DynamicContent
     from gsmap.merge.reference_view_cache import ReferenceViewCache
     from gsmap.register import SceneView
+    from gsmap.types.merging import UnchangedPlace
 
 _MAX_PIXELS = 1 << 24  # of a kept photo: so few bytes can claim any number
 
@@ -230,7 +231,7 @@ class TileMaker:
         store: cache of reference views for other tiles.
         passing: dynamic content to leave out, by scene id.
         photos: reference photos, by scene id.
-        unchanged: places of rejected changes (K, 2, 3), map frame in metres, by scene id.
+        unchanged: places of rejected changes, by scene id.
         cache_key: key of the merged tile among those of earlier exports (`gsmap.map.merged_tiles`).
     """
 
@@ -243,7 +244,7 @@ class TileMaker:
     store: ReferenceViewCache
     passing: Mapping[str, DynamicContent] = field(default_factory=dict)
     photos: Mapping[str, Sequence[StoredPhoto]] = field(default_factory=dict)
-    unchanged: Mapping[str, np.ndarray] = field(default_factory=dict)
+    unchanged: Mapping[str, Sequence[UnchangedPlace]] = field(default_factory=dict)
     cache_key: str = ""
 
     def __call__(self, progress: Progress) -> MergeResult:
@@ -262,7 +263,6 @@ class TileMaker:
         """Merge in metres and return the result in map units."""
         from gsmap.merge.overlap import clamp_inside
         from gsmap.merge.tile import LazyScene, merge_tile
-        from gsmap.types.merging import no_boxes
 
         scenes, metres = _store(self.location).scenes, self.tile.metres_per_unit
         lazy = [
@@ -276,7 +276,7 @@ class TileMaker:
                 "" if (left := self.passing.get(scene)) is None else left.digest,
                 partial(_read_within, self.location, scene, self.passing.get(scene)),
                 tuple(_kept(self.location, photo) for photo in self.photos.get(scene, ())),
-                self.unchanged.get(scene, no_boxes()),
+                tuple(self.unchanged.get(scene, ())),
             )
             for scene, pose in self.tile.poses.items()
         ]

@@ -18,6 +18,7 @@ from gsmap.merge.exposure import apply_balance
 from gsmap.merge.overlap import boxes_overlap, share_in_view
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PosedScene
+from gsmap.types.merging import UnchangedPlace
 
 Prefer = Literal["newest", "best", "both"]
 """Preferred scene where scenes disagree: the ``newest``, the ``best`` observed one, or no preference, so that ``both``
@@ -194,7 +195,11 @@ class _Disagreement:
 
 
 def _find_disagreement(
-    older: CaptureViews, newer: CaptureViews, found: Comparison, prefer: Prefer, unchanged: np.ndarray
+    older: CaptureViews,
+    newer: CaptureViews,
+    found: Comparison,
+    prefer: Prefer,
+    unchanged: Sequence[UnchangedPlace],
 ) -> _Disagreement:
     removed = np.isin(found.older.state, (GONE, REPAINTED))
     replacing = np.isin(found.newer.state, (GONE, REPAINTED))
@@ -210,11 +215,11 @@ def _find_disagreement(
     return _Disagreement(removed, replacing, removed_newer)
 
 
-def _inside_any(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Return an (N,) mask of points (N, 3) in any of the boxes (K, 2, 3), or at most `_FRINGE_M` outside."""
+def _inside_any(points: np.ndarray, places: Sequence[UnchangedPlace]) -> np.ndarray:
+    """Return an (N,) mask of points (N, 3) in any of the places, or at most `_FRINGE_M` outside."""
     out = np.zeros(len(points), dtype=bool)
-    for box in boxes:
-        out |= inside(points, box, _FRINGE_M)
+    for place in places:
+        out |= inside(place.S_frame_map.apply(points), place.box, _FRINGE_M)
     return out
 
 

@@ -22,7 +22,7 @@ from gsmap.merge.reference_view_cache import (
     keys_of,
 )
 from gsmap.types import Cameras, Gaussians, MergeResult, PosedScene, ReferencePhoto, Sim3
-from gsmap.types.merging import no_boxes
+from gsmap.types.merging import UnchangedPlace
 from gsmap.types.progress import Progress
 
 
@@ -52,7 +52,7 @@ class LazyScene:
     without: str = ""
     load_within: Callable[[np.ndarray], Gaussians] | None = None
     photos: tuple[ReferencePhoto, ...] = ()
-    unchanged: np.ndarray = field(default_factory=no_boxes)
+    unchanged: tuple[UnchangedPlace, ...] = ()
 
     def centroid(self) -> np.ndarray | None:
         """(3,) mean of all means of the scene in the map frame; None if the scene is empty."""

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from gsmap.types.cameras import Cameras
 from gsmap.types.gaussians import Gaussians
+from gsmap.types.sim3 import Sim3
 
 
-def no_boxes() -> np.ndarray:
-    """Return an array of no boxes, (0, 2, 3)."""
-    return np.empty((0, 2, 3))
+@dataclass(frozen=True, eq=False)
+class UnchangedPlace:
+    """A place where nothing changed.
+
+    Args:
+        S_frame_map: transforms the map frame, in metres, to the frame of the box.
+        box: (2, 3) lowest and highest corner, in metres.
+    """
+
+    S_frame_map: Sim3
+    box: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +58,8 @@ class PosedScene:
         reference_views: renders of its views (`gsmap.merge.reference_view_cache.PlacedReferenceViews`), given the
             longest side of an image in pixels; None where they are to be rendered from `gaussians`.
         photos: localized photos that show the place as this capture does.
-        unchanged: (K, 2, 3) boxes, map frame, in which a person rejected the changes since this capture: newer captures
-            make nothing outdated there.
+        unchanged: places where a person rejected the changes since this capture: newer captures make nothing outdated
+            there.
     """
 
     gaussians: Gaussians
@@ -60,7 +69,7 @@ class PosedScene:
     centroid: Callable[[], np.ndarray | None] | None = None
     reference_views: Callable[[int], Any] | None = None
     photos: tuple[ReferencePhoto, ...] = ()
-    unchanged: np.ndarray = field(default_factory=no_boxes)
+    unchanged: tuple[UnchangedPlace, ...] = ()
 
     def whole_centroid(self) -> np.ndarray | None:
         """Return the unweighted mean (3,) float64 of all Gaussian means of the capture, map frame; None without

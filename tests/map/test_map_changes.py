@@ -15,12 +15,15 @@ from raising import raises
 import gsmap.change
 import gsmap.map
 from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.export import PlannedTile
 from gsmap.geometry.boxes import moved_box
 from gsmap.geometry.rotations import exp_so3
 from gsmap.map import Map
+from gsmap.map.rejected_changes import places_near, rejected_places
 from gsmap.map.stages.export import Request, plan
 from gsmap.map.visits import Params, Visit, has_moved, pairs_of_visits
 from gsmap.types import Cameras, Change, ChangeReport, Gaussians, PosedScene, PoseGraph, ScenePose, Sim3
+from gsmap.types.metric_scale import MetricScale
 
 DATES = {"may": "2026-05-31T15:00:00Z", "june": "2026-06-30", "july": "2026-07-31"}
 CHAIR = np.array([[0.0, 0, 0], [0.5, 0.5, 1]])
@@ -32,6 +35,7 @@ class Seen:
 
     pairs: list[tuple[str, str]] = field(default_factory=list)
     S_map_place: Sim3 = field(default_factory=Sim3.identity)
+    beside: np.ndarray | None = None  # something else that went
 
 
 @pytest.fixture
@@ -48,6 +52,9 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Seen:
         box = moved_box(CHAIR, found.S_map_place)
         chair = Change("moved", box, CHAIR.astype(np.float32), rows, rows[:2], moved, "half", 0.9, {"through": 7.0})
         wall = Change("recoloured", CHAIR + 3, CHAIR.astype(np.float32) + 3, rows, rows, confidence=0.35)
+        if found.beside is not None:
+            went = Change("disappeared", found.beside, found.beside.astype(np.float32), rows, rows[:0], confidence=0.9)
+            return ChangeReport((chair, went), 0.75, np.ones(3), ())
         return ChangeReport((chair, wall), 0.75, np.array([1.0, 1.1, 0.9]), ("it was dark",))
 
     monkeypatch.setattr(gsmap.change, "compare", compare)
@@ -233,33 +240,66 @@ def test_words_on_changes(site: Map, seen: Seen) -> None:
         site.confirm("c9")
 
 
+def places(m: Map, **options: object) -> dict[str, list[np.ndarray]]:
+    """Where an export overrules nothing: boxes in the map's frame, in metres, by the name of the older scene."""
+    planned = plan(m.store, Request(tile_size_m=0.0, **options), m.settings)
+    assert set(planned.recipe.unchanged) == set(planned.unchanged)
+    out: dict[str, list[np.ndarray]] = {}
+    for near in planned.unchanged.values():
+        for scene, found in near.items():
+            boxes = [moved_box(place.box, place.S_frame_map.inverse()) for place in found]
+            out[m.store.scenes.get(scene).name] = boxes
+    return out
+
+
 def test_an_export_overrules_nothing_where_every_change_was_rejected(site: Map, seen: Seen, tmp_path: Path) -> None:
     def made_again() -> int:
         return site.export(tmp_path / "out", format="ply", tile_size_m=0, steps=0).recomputed
 
-    def places() -> dict[str, np.ndarray]:
-        planned = plan(site.store, Request(tile_size_m=0.0), site.settings)
-        assert set(planned.recipe.unchanged) == set(planned.unchanged)
-        return {site[scene].name: boxes for scene, boxes in planned.unchanged.items()}
-
-    site.changes()
-    assert (made_again(), made_again()) == (1, 0)
-    rows = [row for row in site.changes().changes if row.kind == "moved"]
-    assert len(rows) == 2
-    site.reject(rows[0].id)
-    assert places() == {}  # the chair moved between the other two visits
+    found = site.changes().changes
+    chairs = [row for row in found if row.kind == "moved"]
+    assert (made_again(), made_again(), len(chairs)) == (1, 0, 2)
+    site.reject(chairs[0].id)
+    assert places(site) == {}  # the chair moved between the other two visits
     assert made_again() == 0
-    site.reject(rows[1].id)
-    site.with_settings({"change.min_confidence": 0.3})
-    found = places()
-    assert set(found) == {"may", "june"}
-    np.testing.assert_allclose(found["may"][0], CHAIR, atol=1e-6)
+    site.reject(chairs[1].id)
+    assert set(places(site)) == {"may", "june"}
+    np.testing.assert_allclose(places(site)["may"], [CHAIR], atol=1e-6)
     assert any(row.what == "dirty_tiles" for row in site.status().todo)
     assert (made_again(), made_again()) == (1, 0)
+    place(site, at(0.0006))  # less than makes a tile again
+    assert made_again() == 0
     place(site, Sim3(exp_so3(np.array([0, 0, np.pi / 2])), np.array([5.0, 0, 0]), 2.0))  # half metres, turned
-    np.testing.assert_allclose(places()["may"][0], [[2, 0, 0], [2.5, 0.5, 1]], atol=1e-5)
-    site.reject(rows[0].id, withdraw=True)
-    assert places() == {}
+    np.testing.assert_allclose(places(site)["may"], [[[2, 0, 0], [2.5, 0.5, 1]]], atol=1e-5)
+    site.reject(chairs[0].id, withdraw=True)
+    assert places(site) == {}
+
+
+@pytest.mark.parametrize("turn_deg", [0, 30, 45])
+def test_rejections_hold_however_the_map_lies(site: Map, seen: Seen, turn_deg: float) -> None:
+    seen.beside = CHAIR + np.array([0.55, 0, 0])  # 5 cm beside the chair, and not rejected
+    for row in site.changes().changes:
+        if row.kind == "moved":
+            site.reject(row.id)
+    place(site, at(0.0, turn_deg))
+    assert {name: len(boxes) for name, boxes in places(site).items()} == {"may": 1, "june": 1}
+    place(site, june=at(0.03))  # farther than comparisons hold
+    assert {name: len(boxes) for name, boxes in places(site).items()} == {"may": 1, "june": 1}
+    site.edit("may", captured_at="2026-07-15")  # now the newer of the two
+    assert set(places(site)) == {"june"}
+    assert places(site, as_of="2026-06-30") == {}
+
+
+def test_only_tiles_near_a_rejected_place_are_made_again(site: Map, seen: Seen) -> None:
+    for row in site.changes().changes:
+        site.reject(row.id)
+    placed = site.store.revisions.get()
+    assert placed is not None
+    living = {scene.id: scene for scene in site.scenes()}
+    found = rejected_places(site.store.changes.current(), living, placed.poses, {0: MetricScale()})
+    poses = {scene: Sim3.identity() for scene in living}
+    tiles = [PlannedTile(0, f"{x}", CHAIR + np.array([x, 0, 0]), poses, "") for x in (0.0, 8.0, 20.0)]
+    assert [sum(map(len, places_near(found, tile, 10.0).values())) for tile in tiles] == [4, 4, 0]
 
 
 def test_status_counts_the_open_changes_that_are_listed(site: Map, seen: Seen) -> None:

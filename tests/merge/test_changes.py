@@ -7,6 +7,7 @@ from synthetic_changes import box, dated, patched, plain
 from synthetic_walls import cameras_facing, texture, wall
 
 from gsmap import compare
+from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.merge import changes, default_params, merge
 from gsmap.merge.changes import resolve_changes
@@ -14,7 +15,8 @@ from gsmap.merge.exposure import apply_gain
 from gsmap.merge.mergers import tto
 from gsmap.merge.references import render_references
 from gsmap.render import render
-from gsmap.types import Gaussians
+from gsmap.types import Gaussians, Sim3
+from gsmap.types.merging import UnchangedPlace
 
 Params = type(default_params("tto"))
 
@@ -43,10 +45,13 @@ def test_what_a_later_capture_looked_through_is_gone():
 
 def test_nothing_is_outdated_where_the_changes_were_rejected():
     old, new = dated("old", 2020, wall(0, -1.5, 1.5), box(5)), dated("new", 2021, wall(1, -1.5, 1.5))
-    around = np.array([[[-0.2, -0.15, -0.5], [0.2, 0.15, -0.5]]])
+    S_frame_map = Sim3(exp_so3(np.array([0, 0, 0.6])), np.array([3.0, 1, 0]))  # the box lies in a frame of its own
+    low, high = S_frame_map.apply(np.array([[-0.2, -0.15, -0.5], [0.2, 0.15, -0.5]]))
+    middle, half = (low + high) / 2, np.array([0.25, 0.25, 0.01])
+    around = (UnchangedPlace(S_frame_map, np.array([middle - half, middle + half])),)
     assert resolve_changes([replace(old, unchanged=around), new]).num_removed == [0, 0]
     # Beside the rejected place, and where the older one is preferred, all is as before.
-    beside = replace(old, unchanged=around + np.array([2.0, 0, 0]))
+    beside = replace(old, unchanged=(UnchangedPlace(Sim3.identity(), around[0].box),))
     assert resolve_changes([beside, new]).num_removed == resolve_changes([old, new]).num_removed
     bare, boxed = dated("old", 2020, wall(0, -1.5, 1.5)), dated("new", 2021, wall(1, -1.5, 1.5), box(5))
     once = replace(boxed, cameras=cameras_facing([0.0], distance=3.6))

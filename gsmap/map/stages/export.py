@@ -25,19 +25,20 @@ from gsmap.geometry.transforms import transform_cameras
 from gsmap.map.date_filter import end_of_date, is_until, undated_note
 from gsmap.map.jobs import TileMaker
 from gsmap.map.metric_scales import map_metres, metre_notes
-from gsmap.map.rejected_changes import rejected_places
+from gsmap.map.rejected_changes import places_near, rejected_places
 from gsmap.map.settings import Settings
 from gsmap.map.shared_jobs import note_interruption
 from gsmap.map.stages.change import standing_comparisons
 from gsmap.map.static_filter import DynamicContent, dynamic_notes, find_dynamic_content
 from gsmap.map.world import GeoreferencedComponent, georeferenced_components, world_notes
-from gsmap.merge import photos_m, reach_m, recipe_key, uses_dates, with_prefer, with_steps
+from gsmap.merge import merger, photos_m, reach_m, recipe_key, uses_dates, with_prefer, with_steps
 from gsmap.merge.reference_view_cache import ReferenceViewCache
 from gsmap.methods import text_digest
 from gsmap.store import Store
 from gsmap.store.photos import StoredPhoto
 from gsmap.texts import escaped
 from gsmap.types import Cameras, PoseGraph, Scene, ScenePose, Tile
+from gsmap.types.merging import UnchangedPlace
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.plain import canonical, plain
 from gsmap.types.progress import Progress
@@ -122,7 +123,7 @@ class ExportPlan:
         world: georeferenced components.
         passing: dynamic content to leave out of each scene.
         photos: reference photos by component and tile name.
-        unchanged: places of rejected changes (`gsmap.map.rejected_changes`).
+        unchanged: places of rejected changes near a tile, by scene id, by component and tile name.
     """
 
     revision: int | None
@@ -136,7 +137,7 @@ class ExportPlan:
     world: Mapping[int, GeoreferencedComponent] = field(default_factory=dict)
     passing: Mapping[str, DynamicContent] = field(default_factory=dict)
     photos: Mapping[tuple[int, str], Sequence[StoredPhoto]] = field(default_factory=dict)
-    unchanged: Mapping[str, np.ndarray] = field(default_factory=dict)
+    unchanged: Mapping[tuple[int, str], Mapping[str, Sequence[UnchangedPlace]]] = field(default_factory=dict)
 
 
 def plan(store: Store, request: Request, settings: Settings, known: MapObjects | None = None) -> ExportPlan:
@@ -169,15 +170,13 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
     if request.as_of is not None:
         scenes, notes = _as_of(scenes, request.as_of)
         placed = {scene: placed[scene] for scene in scenes}
-    unchanged: dict[str, np.ndarray] = {}
+    rejected: dict[str, list[UnchangedPlace]] = {}
     if uses_dates(method, params):
         recipe = recipe.with_dates({scene: found.captured_at for scene, found in scenes.items()})
         from gsmap.map.undated_overlaps import undated_notes  # imported here, as status does not need it
 
         notes += undated_notes(store, scenes.values())
-        if any(change.status == "rejected" for one in store.changes.current() for change in one.changes):
-            unchanged = rejected_places(standing_comparisons(store, settings), placed, metres)
-        recipe = replace(recipe, unchanged={scene: _digest_boxes(boxes) for scene, boxes in unchanged.items()})
+        rejected = rejected_places(store.changes.current(), scenes, placed, metres)
     passing: dict[str, DynamicContent] = {}
     if request.static:
         from gsmap.map.objects import load_objects
@@ -208,6 +207,10 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
     )
     photos = _photos(store, tiles, photos_m(method, params), request.as_of)
     recipe = replace(recipe, photos={tile: _digest(kept) for tile, kept in photos.items()})
+    around_m = reach_m(method, params) + merger(method).looking_m(params)
+    near = {(tile.component, tile.name): places_near(rejected, tile, around_m) for tile in tiles if rejected}
+    unchanged = {tile: places for tile, places in near.items() if places}
+    recipe = replace(recipe, unchanged={tile: _digest_places(places) for tile, places in unchanged.items()})
     return ExportPlan(revision, scenes, method, params, recipe, tiles, notes, metres, world, passing, photos, unchanged)
 
 
@@ -252,8 +255,9 @@ def _digest(kept: Sequence[StoredPhoto]) -> str:
     return text_digest(canonical(plain(rows)))[:32]
 
 
-def _digest_boxes(boxes: np.ndarray) -> str:
-    return text_digest(canonical(plain(boxes.round(3))))[:32]
+def _digest_places(places: Mapping[str, Sequence[UnchangedPlace]]) -> str:
+    """Return a digest of boxes in their own frames; where these lie follows from the poses."""
+    return text_digest(canonical({scene: [plain(place.box) for place in of] for scene, of in places.items()}))[:32]
 
 
 def export(
@@ -406,7 +410,7 @@ def make_content(store: Store, planned: ExportPlan, settings: Settings, tile: Pl
         captured_at={scene: planned.scenes[scene].captured_at for scene in tile.poses},
         store=ReferenceViewCache(folder, settings.export.max_shared_bytes),
         passing={scene: planned.passing[scene] for scene in tile.poses if scene in planned.passing},
-        unchanged={scene: planned.unchanged[scene] for scene in tile.poses if scene in planned.unchanged},
+        unchanged=planned.unchanged.get((tile.component, tile.name), {}),
         photos=_by_scene(planned.photos.get((tile.component, tile.name), ())),
     )
 
