@@ -68,17 +68,21 @@ def open_transfer(
         )
     with contextlib.ExitStack() as stack:
         staged: dict[tuple[str, str], StagedGroup] = {}
+        damaged: set[str] = set()
         if not same_home:
             with source.arrays.lock():  # groups of this snapshot must not be reclaimed before they are copied
                 theirs = stack.enter_context(source.catalog.read())
                 with into.catalog.read() as ours:
-                    missing = _missing_groups(into, ours, theirs, only, mend)
+                    missing, derived = _missing_groups(into, ours, theirs, only, mend)
+                lost = {group for group in derived if source.arrays.problems(*group, missing[group])}
+                missing = {group: files for group, files in missing.items() if group not in lost}
+                damaged = {group for _, group in lost}
                 staged = stack.enter_context(into.arrays.stage_copies(source.arrays, missing))
         ours = stack.enter_context(into.catalog.write())
         into.catalog.hold_until_commit(into.arrays.lock())
         if same_home:
             theirs = stack.enter_context(source.catalog.read())
-        yield Transfer(into, source, ours, theirs, only, None if same_home else staged)
+        yield Transfer(into, source, ours, theirs, only, None if same_home else staged, damaged)
 
 
 class Transfer:
@@ -98,6 +102,7 @@ class Transfer:
         theirs: Connection,
         only: Collection[str] | None,
         staged: dict[tuple[str, str], StagedGroup] | None,
+        damaged: Collection[str],
     ) -> None:
         self.into, self.source = into, source
         self.ours, self.theirs = ours, theirs
@@ -105,6 +110,7 @@ class Transfer:
         self.notes: list[str] = []
         self.renamed: list[tuple[str, str]] = []
         self._staged = staged
+        self._damaged = damaged  # groups of the other map that are computed again, so they are not copied
         self._is_whole_map = only is None
         rows = theirs.execute(select(scenes).order_by(scenes.c.number)).all()
         self._rows = [row for row in rows if only is None or row.id in only]
@@ -257,21 +263,26 @@ class Transfer:
     def results(self) -> None:
         """Copy the results of single scenes; if both maps have one with the same key, keep that of this map.
 
-        Graphs are identified by their keys. Of other kinds a scene has one result, which holds for its stored
-        Gaussians: it is copied where this map has none, and only for the same Gaussians.
+        Graphs are identified by their keys; of a scene that is thinned there only, they are copied where this map has
+        none. Of other kinds a scene has one result, which holds for its stored Gaussians: it is copied where this map
+        has none, and only for the same Gaussians. Damaged ones are left out.
         """
         whose = self.ours.execute(select(results).where(results.c.scene.is_not(None))).all()
         here = {(row.kind, row.key): row.group_id for row in whose}
         has_one = {(row.kind, row.scene) for row in whose}
         stored = {row.id: row.group_id for row in self.ours.execute(select(scenes.c.id, scenes.c.group_id))}
-        their_scenes = {row.id: row.group_id for row in self._rows}
+        their_scenes = {row.id: row for row in self._rows}
         theirs = select(results).where(results.c.scene.is_not(None)).order_by(results.c.created_at, results.c.number)
         for row in self.theirs.execute(theirs).all():
             if row.scene not in self.wanted:
                 continue
             is_known = (row.kind, row.key) in here
-            is_other = (row.kind, row.scene) in has_one or stored[row.scene] != their_scenes[row.scene]
-            if not is_known and row.kind != GRAPHS.kind and is_other:
+            scene, has_any = their_scenes[row.scene], (row.kind, row.scene) in has_one
+            if stored[row.scene] == scene.group_id:
+                is_useful = row.kind == GRAPHS.kind or not has_any
+            else:
+                is_useful = row.kind == GRAPHS.kind and not (scene.thinned is not None and has_any)
+            if not is_known and (not is_useful or row.group_id in self._damaged):
                 continue
             if not is_known or row.group_id == here[row.kind, row.key]:
                 self.transfer_group(row.kind, row.group_id)
@@ -453,8 +464,9 @@ class Transfer:
 
 def _missing_groups(
     into: Store, ours: Connection, theirs: Connection, only: Collection[str] | None, mend: bool
-) -> dict[tuple[str, str], tuple[StoredFile, ...]]:
-    """Return manifests, by (kind, id), of groups that the scenes need and that are missing or damaged in this map."""
+) -> tuple[dict[tuple[str, str], tuple[StoredFile, ...]], set[tuple[str, str]]]:
+    """Return manifests, by (kind, id), of groups that the scenes need and that are missing or damaged in this map; and
+    the groups among them that gsmap computes again if they are lost."""
     named = [(SCENES, row.id, row.group_id) for row in theirs.execute(select(scenes.c.id, scenes.c.group_id))]
     of_whole = results.join(scenes, scenes.c.id == results.c.scene)
     kept = select(results).select_from(of_whole).where(scenes.c.thinned.is_(None))
@@ -473,11 +485,13 @@ def _missing_groups(
     def is_lacking(kind: str, group: str) -> bool:
         return group not in here or (mend and bool(into.arrays.problems(kind, group, manifest(ours, group))))
 
-    return {
+    missing = {
         (kind, group): manifest(theirs, group)
         for kind, scene, group in named
         if group is not None and scene not in forgotten and (only is None or scene in only) and is_lacking(kind, group)
     }
+    computed = set(theirs.execute(select(results.c.group_id).where(results.c.kind != GRAPHS.kind)).scalars())
+    return missing, {group for group in missing if group[1] in computed}
 
 
 def _forgotten(connection: Connection) -> set[str]:

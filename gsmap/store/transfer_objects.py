@@ -26,6 +26,7 @@ def transfer_objects(transfer: Transfer) -> None:
         if row.scene in transfer.wanted:
             found.setdefault(row.object, {})[row.scene] = np.array(row.box, np.float64)
     numbers: dict[int, int] = {}
+    is_new = False
     for their_number, number in zip(found, match_objects(ours, list(found.values())), strict=True):
         if number is None:
             made = insert(objects).returning(objects.c.number)
@@ -37,7 +38,8 @@ def transfer_objects(transfer: Transfer) -> None:
         for scene, box in found[their_number].items():
             if scene not in here:
                 ours.execute(insert(object_places), {"object": number, "scene": scene, "box": box.tolist()})
-    if found:
+                is_new = True
+    if is_new:
         forget_sets(ours, transfer.wanted)
     _join_facts(transfer, numbers)
 

@@ -14,7 +14,7 @@ from gsmap.store import Store, merging, purging
 from gsmap.store.backup import restoring
 from gsmap.store.results import DerivedArrays
 from gsmap.store.sizes import sizes
-from gsmap.types import Scene
+from gsmap.types import Scene, SceneGraph
 
 
 class MeanColours(DerivedArrays):
@@ -85,6 +85,30 @@ def test_of_a_thinned_scene_it_is_forgotten_and_not_copied(store: Store, scene: 
         MeanColours(other).save(scene.id, 2 * GREY)
         merging.merge(store, other)  # the scene is whole again, and the result comes with it
         assert np.array_equal(MeanColours(store).load(scene.id), 2 * GREY)
+
+
+def test_damage_in_the_other_map_ends_no_merge(store: Store, scene: Scene, tmp_path: Path) -> None:
+    (name,) = groups(store)
+    file = store.folder / "arrays" / "colours" / name / "arrays.zip"
+    file.write_bytes(file.read_bytes()[:-50])
+    with Store.create(tmp_path / "other.gsmap") as other:
+        assert merging.merge(other, store).num_scenes == 1
+        assert MeanColours(other).load(scene.id) is None
+        assert other.check().ok
+
+
+def test_a_graph_of_a_thinned_scene_does_not_follow_that_of_the_whole_one(
+    store: Store, scene: Scene, tmp_path: Path
+) -> None:
+    with Store.create(tmp_path / "whole.gsmap") as whole:
+        whole.scenes.add(make_gaussians(), make_cameras(), name="a")
+        whole.graphs.save(SceneGraph(scene.id, {}, None, 2.0), key("describe", scene.id))
+        store.scenes.thin("a", np.arange(scene.num_gaussians) < 100)
+        store.graphs.save(SceneGraph(scene.id, {}, None, 3.0), key("things", scene.id))
+        assert merging.merge(whole, store).num_graphs == 0
+        assert [graph.unit_m for graph in whole.graphs.list()] == [2.0]
+        assert merging.merge(store, whole).num_graphs == 1  # the scene is whole again
+        assert [graph.unit_m for graph in store.graphs.list()] == [2.0]
 
 
 def test_it_goes_with_its_scene(store: Store, scene: Scene) -> None:
