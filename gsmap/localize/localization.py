@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from PIL import Image
@@ -196,9 +196,12 @@ def evaluate_candidates(
 
 
 def _agrees_with(candidate: PoseCandidate, found: EvaluatedPose, photo: ScaledPhoto) -> bool:
-    """Return whether most matches of a candidate are inliers of a refined pose that is probable enough."""
+    """Return whether a candidate would be refined to a refined pose that is probable enough: it lies near that pose, or
+    most of its matches are inliers of that pose."""
     if found.probability < _SKIP_PROBABILITY or candidate.component != found.candidate.component:
         return False
+    if is_duplicate(candidate, replace(found.candidate, T_metric_camera=found.refined.T_metric_camera)):
+        return True
     refined = (found.refined.T_metric_camera, found.refined.intrinsics_px, photo.size_px)
     inliers = resection.find_inliers(candidate.pixels, candidate.points, *refined)
     return bool(inliers.sum() > len(inliers) / 2)

@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gsmap import _native
 from gsmap.geometry.projection import project
-from gsmap.localize import candidate_renders, localization, refinement
+from gsmap.localize import candidate_renders, direct_alignment, localization, refinement
 from gsmap.localize.candidates import PoseCandidate
-from gsmap.localize.resection import retract_pose
+from gsmap.localize.map_scene import MapScene
+from gsmap.localize.resection import relative_xi, retract_pose
 
 ALIASED_PRIOR = 0.1
 
@@ -76,8 +78,10 @@ def test_matches_of_a_place_that_was_found_are_not_looked_into_again(judged):
     )
     same = replace(rough, pixels=pixels, points=settled.points)
     other = replace(rough, pixels=pixels, points=settled.points + np.array([3.0, 0, 0]))
+    near = replace(other, T_metric_camera=retract_pose(settled.T_metric_camera, np.full(6, 0.05)))
     assert localization._agrees_with(same, found, picture)
     assert not localization._agrees_with(other, found, picture)
+    assert localization._agrees_with(near, found, picture)  # it would be refined to the same pose
     assert not localization._agrees_with(replace(same, component=1), found, picture)
     assert not localization._agrees_with(same, replace(found, probability=0.4), picture)
 
@@ -92,10 +96,15 @@ def test_what_is_hopeless_is_not_asked_what_it_shows_otherwise(world, judged, mo
     assert np.array_equal(asked.refined.T_metric_camera, spared.refined.T_metric_camera)
 
 
-@pytest.mark.parametrize(("first", "second", "kept"), [(0.6, 0.7, "first"), (0.3, 0.4, "second"), (0.3, 0.2, "first")])
-def test_where_a_render_agrees_little_its_pose_is_settled_once_more(judged, monkeypatch, first, second, kept):
+@pytest.mark.parametrize(
+    ("first", "second", "moved_sigmas", "kept"),
+    [(0.6, 0.7, 9.0, "first"), (0.3, 0.4, 9.0, "second"), (0.3, 0.2, 9.0, "first"), (0.3, 0.4, 1.0, "first")],
+)
+def test_a_refinement_that_agrees_little_is_repeated_unless_it_converged(
+    judged, monkeypatch, first, second, moved_sigmas, kept
+):
     picture, found = judged
-    told = iter([replace(found.refined, agreement=first), replace(found.refined, agreement=second)])
+    told = iter([replace(found.refined, agreement=one, moved_sigmas=moved_sigmas) for one in (first, second)])
     starts = []
 
     def settled(picture, pose, *rest):
@@ -106,8 +115,36 @@ def test_where_a_render_agrees_little_its_pose_is_settled_once_more(judged, monk
     rough = retract_pose(found.refined.T_metric_camera, np.full(6, 0.1))
     answer = refinement.refine_pose(picture, rough, picture.intrinsics_px, ())
     assert answer.agreement == {"first": first, "second": second}[kept]
-    assert len(starts) == (1 if first > refinement.REPEAT_BELOW_AGREEMENT else 2)
-    assert np.array_equal(starts[-1], rough if len(starts) == 1 else found.refined.T_metric_camera)
+    repeated = first < refinement.REPEAT_BELOW_AGREEMENT and moved_sigmas > refinement.CONVERGED_SIGMAS
+    assert len(starts) == 1 + repeated
+    assert np.array_equal(starts[-1], found.refined.T_metric_camera if repeated else rough)
+
+
+def test_the_motion_of_a_refinement_is_that_of_all_its_direct_alignments(world, judged, monkeypatch):
+    picture, found = judged
+    starts, align = [], direct_alignment.align
+    monkeypatch.setattr(direct_alignment, "align", lambda *a, **k: (starts.append(a[2]), align(*a, **k))[1])
+    one = refinement.refine_pose(picture, found.candidate.T_metric_camera, picture.intrinsics_px, [world.placed])
+    turn = one.T_metric_camera[:3, :3].T @ starts[0][:3, :3]
+    shift = one.T_metric_camera[:3, :3].T @ (starts[0][:3, 3] - one.T_metric_camera[:3, 3])
+    xi = np.r_[Rotation.from_matrix(turn).as_rotvec(), shift]
+    assert len(starts) == len(direct_alignment.BLUR_PX)
+    assert one.moved_sigmas == pytest.approx(np.sqrt(xi @ np.linalg.inv(one.covariance) @ xi / 6), rel=1e-6)
+
+
+def test_a_repeat_uses_renders_that_hardly_moved(world, judged, monkeypatch):
+    picture, found = judged
+    counts = []
+    for name in ("render", "render_positions"):
+        run = getattr(MapScene, name)
+        monkeypatch.setattr(MapScene, name, lambda self, camera, run=run: (counts.append(1), run(self, camera))[1])
+    start = picture, found.refined.T_metric_camera, picture.intrinsics_px, [world.placed]
+    anew = refinement._refine_once(*start)
+    num_anew = len(counts)
+    reused = refinement._refine_once(*start, anew.renders)
+    assert len(counts) - num_anew < num_anew
+    xi = relative_xi(anew.T_metric_camera, reused.T_metric_camera)
+    assert np.sqrt(xi @ np.linalg.solve(anew.covariance, xi) / 6) < 0.3
 
 
 def test_how_well_a_render_agrees_that_is_laid_over_is_evidence(world, judged):
