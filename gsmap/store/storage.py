@@ -43,6 +43,11 @@ def chunks_of(path: Path) -> Iterator[bytes]:
 
 SINGLE_PUT_BYTES = 64 << 20  # up to this size an object is one request; above, its parts appear as one at the end
 _PART_BYTES = 16 << 20  # S3 allows 10,000 parts: objects of up to 160 GB
+_SMALL_BYTES = 1 << 20  # larger bodies may take longer than _SILENCE to send, while the server is silent
+_SILENCE = timedelta(seconds=30)  # a request is sent again if the server sends nothing for this long
+_MAX_REQUEST = timedelta(minutes=10)
+_MAX_RETRY = timedelta(minutes=12)  # above _MAX_REQUEST, or a request that timed out is not sent again
+_EXPIRED = ("ExpiredToken", "InvalidToken", "TokenRefreshRequired")  # S3 sends them as 400 Bad Request
 _STAGING = "staging"
 _NAME = re.compile(r"[a-z0-9]+(/[0-9a-zA-Z._-]+){0,2}|gsmap-backup\.json")  # names that gsmap uses
 
@@ -279,19 +284,24 @@ class BucketStorage:
         self.url = f"s3://{bucket}/{prefix}".rstrip("/")
         endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
         options: dict[str, Any] = {"endpoint": endpoint} if endpoint else {}
-        client: Any = {"timeout": timedelta(minutes=10), "connect_timeout": timedelta(seconds=20)}
+        client: Any = {"timeout": _MAX_REQUEST, "connect_timeout": timedelta(seconds=20)}
         if endpoint.startswith("http://"):  # the user chose plain HTTP
             client["allow_http"] = True
         self._api = obstore
-        with self._translate_errors("open"):
-            self._store = S3Store(
+
+        def connect(**limits: Any) -> S3Store:
+            return S3Store(
                 bucket,
                 prefix=prefix or None,
-                client_options=client,
-                retry_config={"max_retries": 6, "retry_timeout": timedelta(minutes=2)},
+                client_options=client | limits,
+                retry_config={"max_retries": 6, "retry_timeout": _MAX_RETRY},
                 checksum_algorithm="sha256",  # the server rejects corrupted uploads
                 **options,
             )
+
+        with self._translate_errors("open"):
+            self._store = connect(read_timeout=_SILENCE)
+            self._uploads = connect()  # the server is silent until it has the whole body
 
     def list(self, prefix: str) -> dict[str, ObjectInfo]:
         out: dict[str, ObjectInfo] = {}
@@ -315,10 +325,10 @@ class BucketStorage:
         try:
             with self._translate_errors("write"):
                 if size_bytes <= SINGLE_PUT_BYTES:
-                    self._api.put(self._store, name, b"".join(chunks), use_multipart=False)
+                    self._api.put(self._sender(size_bytes), name, b"".join(chunks), use_multipart=False)
                 else:
                     self._api.put(
-                        self._store, name, iter(chunks), use_multipart=True, chunk_size=_PART_BYTES, max_concurrency=4
+                        self._uploads, name, iter(chunks), use_multipart=True, chunk_size=_PART_BYTES, max_concurrency=4
                     )
         except StorageRequestError:
             # The response may have been lost, not the object: an object named by its digest is the one sent.
@@ -326,13 +336,16 @@ class BucketStorage:
                 return
             raise
 
+    def _sender(self, size_bytes: int) -> Any:
+        return self._store if size_bytes <= _SMALL_BYTES else self._uploads
+
     def put_if_absent(self, name: str, content: bytes) -> bool:
         """Write an object unless one of this name exists; return True if it was written."""
         from obstore.exceptions import AlreadyExistsError
 
         with self._translate_errors("write"):
             try:
-                self._api.put(self._store, name, content, use_multipart=False, mode="create")
+                self._api.put(self._sender(len(content)), name, content, use_multipart=False, mode="create")
             except AlreadyExistsError:
                 return False
         return True
@@ -372,14 +385,17 @@ class BucketStorage:
 
         try:
             yield
-        except (PermissionDeniedError, UnauthenticatedError) as error:
-            raise StorageRequestError(
-                f"{self.url}: not allowed to {what} ({_first_line(error)}): check AWS_ACCESS_KEY_ID",
-                code="storage_refused",
-            ) from error
         except (BaseError, OSError) as error:
+            refused = isinstance(error, (PermissionDeniedError, UnauthenticatedError))
+            if refused or _error_code(error) in _EXPIRED:
+                raise StorageRequestError(
+                    f"{self.url}: not allowed to {what} ({_first_line(error)}): check the credentials "
+                    "(AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_SESSION_TOKEN), which may have expired",
+                    code="storage_refused",
+                ) from error
             raise StorageRequestError(
-                f"{self.url}: cannot {what} ({_first_line(error)}): check AWS_ENDPOINT_URL, and try again",
+                f"{self.url}: cannot {what} ({_first_line(error)}): check AWS_ENDPOINT_URL and the credentials "
+                "(AWS_...), and try again",
                 code="storage_failed",
             ) from error
 
@@ -388,8 +404,15 @@ class StorageRequestError(StoreError):
     """A request to an object store failed, or its response was lost."""
 
 
+def _error_code(error: BaseException) -> str:
+    """Return the code in the XML that a server sent with an error; empty without one."""
+    found = re.search(r"<Code>(\w+)</Code>", str(error))
+    return found[1] if found else ""
+
+
 def _first_line(error: BaseException) -> str:
-    """Return an error message without the XML that servers append, and without the password of a URL."""
-    lines = re.split(r"\n|: <\?xml|\bDebug source", str(error).strip())
+    """Return an error message with the code of a server's XML in place of the XML, and without a URL's password."""
+    lines = re.split(r"\n|: <\?xml|: <Error>|\bDebug source", str(error).strip())
     without_password = re.sub(r"//[^\s/?#]*@", "//", lines[0])  # of an endpoint
-    return re.sub(r"\s+", " ", without_password)[:300]
+    code = _error_code(error)
+    return re.sub(r"\s+", " ", without_password)[:300] + (f": {code}" if code else "")

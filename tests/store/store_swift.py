@@ -149,9 +149,16 @@ class Wire:
 
     Args:
         every: 0 to lose none.
+        faults: by the method of a request, the answers to its first requests, which do not reach the server; an empty
+            one never comes.
+        delay_s: by which answers of the server are late.
     """
 
-    def __init__(self, url: str, every: int = 0) -> None:
+    def __init__(
+        self, url: str, every: int = 0, faults: dict[str, list[bytes]] | None = None, delay_s: float = 0.0
+    ) -> None:
+        self.faults = {f"{method} ".encode(): answers for method, answers in (faults or {}).items()}
+        self.delay_s = delay_s
         self.host, port = url.removeprefix("http://").split(":")
         self.port = int(port)
         self.every = every
@@ -177,6 +184,13 @@ class Wire:
     def _forward(self, client: socket.socket, server: socket.socket) -> None:
         try:
             while data := client.recv(1 << 16):
+                answers = next((a for method, a in self.faults.items() if data.startswith(method)), [])
+                if answers:
+                    client.sendall(answers.pop(0))
+                    while client.recv(1 << 16):
+                        pass
+                    server.close()
+                    return
                 server.sendall(data)
         except OSError:
             pass
@@ -186,6 +200,7 @@ class Wire:
             while data := server.recv(1 << 16):
                 self.num_bytes += len(data)
                 if data.startswith(b"HTTP/1.1 "):
+                    time.sleep(self.delay_s)
                     self.answers += 1
                     if self.every and next(self._count) % self.every == 0:
                         self.lost += 1
@@ -197,6 +212,12 @@ class Wire:
             with contextlib.suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)
             one.close()
+
+
+def refusal(status: int, code: str) -> bytes:
+    """An answer of S3 that refuses a request."""
+    body = f'<?xml version="1.0"?><Error><Code>{code}</Code><Message>no</Message></Error>'
+    return f"HTTP/1.1 {status} No\r\nConnection: close\r\nContent-Length: {len(body)}\r\n\r\n{body}".encode()
 
 
 def _free_ports(count: int) -> list[int]:

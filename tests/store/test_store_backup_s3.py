@@ -1,12 +1,14 @@
 """Backups in an object store: a real server that speaks S3."""
 
 import itertools
+import time
+from datetime import timedelta
 
 import pytest
 from raising import raises
 from store_backups import fill, holdings
 from store_samples import make_cameras, make_gaussians
-from store_swift import BUCKET, ENVIRONMENT, Wire
+from store_swift import BUCKET, ENVIRONMENT, Wire, refusal
 
 from gsmap.errors import CorruptError, MissingDependencyError, NotFoundError, StoreError
 from gsmap.store import storage as places_module
@@ -131,6 +133,41 @@ def test_what_cannot_be_reached_is_said_in_one_line(filled, place, monkeypatch, 
         save(filled, open_storage(place.url))
     assert "a-wrong-secret" not in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("code", ["ExpiredToken", "InvalidToken"])
+def test_expired_credentials_are_named(server, place, monkeypatch, code):
+    wire = Wire(server.url, faults={"GET": [refusal(400, code)]})
+    monkeypatch.setenv("AWS_ENDPOINT_URL", wire.url)
+    with raises(StoreError, code="storage_refused") as caught:
+        list(open_storage(place.url).get("x"))
+    assert code in str(caught.value)
+    wire.close()
+
+
+def test_a_request_without_an_answer_is_sent_again(server, place, monkeypatch):
+    place.put("x", [b"1"], 1)
+    monkeypatch.setattr(places_module, "_SILENCE", timedelta(seconds=1))
+    wire = Wire(server.url, faults={"GET": [b""], "HEAD": [b""]})
+    monkeypatch.setenv("AWS_ENDPOINT_URL", wire.url)
+    there = open_storage(place.url)
+    begun = time.monotonic()
+    assert b"".join(there.get("x")) == b"1"
+    assert there.size_bytes("x") == 1
+    assert 1.5 < time.monotonic() - begun < 10
+    wire.close()
+
+
+def test_a_server_is_silent_during_a_long_upload(server, place, monkeypatch):
+    monkeypatch.setattr(places_module, "_SILENCE", timedelta(seconds=0.5))
+    wire = Wire(server.url, delay_s=1.0)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", wire.url)
+    there = open_storage(place.url)
+    content = bytes(places_module._SMALL_BYTES + 1)
+    there.put("x", [content], len(content))
+    assert there.put_if_absent("y", content)
+    assert wire.answers == 2
+    wire.close()
 
 
 def test_without_the_package(monkeypatch):
