@@ -7,14 +7,18 @@ recently used ones are evicted first. All of it may be deleted at any time.
 from __future__ import annotations
 
 import contextlib
+import functools
 import glob
 import hashlib
+import logging
 import os
 import uuid
 from collections.abc import Iterable
 from pathlib import Path
 
 from gsmap.errors import ConfigError, CorruptError
+
+_log = logging.getLogger("gsmap.store")
 
 FOLDER_VARIABLE = "GSMAP_CACHE"
 SIZE_VARIABLE = "GSMAP_CACHE_MB"
@@ -44,7 +48,7 @@ def find(sha256: str) -> Path | None:
     path = folder() / "files" / sha256
     with contextlib.suppress(OSError):
         os.utime(path)
-        return path
+        return path if path.is_file() else None
     return None
 
 
@@ -56,6 +60,7 @@ def keep(sha256: str, chunks: Iterable[bytes], what: str) -> Path:
 
     Raises:
         CorruptError: the bytes do not match the digest; nothing is stored.
+        OSError: the cache cannot be written.
     """
     root = folder() / "files"
     root.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -78,6 +83,22 @@ def drop(sha256: str) -> None:
     """Delete cached files by digest or digest prefix."""
     for path in (folder() / "files").glob(f"{glob.escape(sha256)}*"):
         path.unlink(missing_ok=True)
+
+
+def report_failure(error: OSError) -> None:
+    """Log an error of the cache, once for each folder and error."""
+    _warn(folder(), error.strerror or str(error))
+
+
+@functools.cache
+def _warn(root: Path, reason: str) -> None:
+    _log.warning(
+        "the cache %s cannot be used (%s), so that files are downloaded at each read: free some space, or set %s to "
+        "another folder",
+        root,
+        reason,
+        FOLDER_VARIABLE,
+    )
 
 
 def make_room(root: Path) -> None:

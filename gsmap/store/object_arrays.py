@@ -7,7 +7,7 @@ writer checks under the lock that the objects of a group still exist before nami
 requires the same lock.
 
 Partial reads need few requests: nearby ranges are merged. Files read whole, or nearly, are cached on this machine
-(`gsmap.store.cache`).
+(`gsmap.store.cache`); where the cache fails, their ranges are read into memory.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ class ObjectArrays(Arrays):
         except CorruptError:
             if not reader.dropped():
                 raise
-        return read(_ObjectReader(self, kind, name, files))
+        return read(_ObjectReader(self, kind, name, files, use_cached=False))
 
     def problems(self, kind: str, name: str, files: Sequence[StoredFile]) -> list[str]:
         out = []
@@ -243,21 +243,32 @@ class ObjectArrays(Arrays):
 
 
 class _ObjectReader:
-    """Read files of a group in an object store."""
+    """Read files of a group in an object store.
 
-    def __init__(self, arrays: ObjectArrays, kind: str, name: str, files: Sequence[StoredFile]) -> None:
+    Args:
+        use_cached: read files that are in the cache already.
+    """
+
+    def __init__(
+        self, arrays: ObjectArrays, kind: str, name: str, files: Sequence[StoredFile], *, use_cached: bool = True
+    ) -> None:
         self._storage = arrays._storage
         self._files = {file.path: file for file in files}
         self._keys = {file.path: arrays._key(kind, name, file) for file in files}
-        self._whole = {path: cache.find(file.sha256) for path, file in self._files.items()}
+        self._whole = {path: cache.find(file.sha256) if use_cached else None for path, file in self._files.items()}
         self._held: dict[str, list[tuple[int, bytes]]] = {path: [] for path in self._files}
 
     def read(self, file: str, start: int, stop: int) -> bytes:
         if (whole := self._whole[file]) is not None:
-            with contextlib.suppress(FileNotFoundError), open(whole, "rb") as opened:
-                opened.seek(start)
-                return opened.read(stop - start)
-            self._whole[file] = None  # evicted from the cache
+            try:
+                with open(whole, "rb") as opened:
+                    opened.seek(start)
+                    return opened.read(stop - start)
+            except FileNotFoundError:
+                pass  # evicted from the cache
+            except OSError as error:
+                cache.report_failure(error)
+            self._whole[file] = None
         for at, held in self._held[file]:
             if at <= start and stop <= at + len(held):
                 return held[start - at : stop - at]
@@ -272,8 +283,11 @@ class _ObjectReader:
         few = merge_ranges(missing, MAX_REQUESTS)
         if sum(stop - start for start, stop in few) > _WHOLE * size:
             one = self._files[file]
-            self._whole[file] = cache.keep(one.sha256, self._storage.get(self._keys[file]), self._keys[file])
-            return
+            try:
+                self._whole[file] = cache.keep(one.sha256, self._storage.get(self._keys[file]), self._keys[file])
+                return
+            except OSError as error:
+                cache.report_failure(error)
         found = self._storage.get_ranges(self._keys[file], few)
         self._held[file] += [(start, content) for (start, _), content in zip(few, found, strict=True)]
 
@@ -281,7 +295,10 @@ class _ObjectReader:
         """Delete the group's files from the cache; return True if the cache had any."""
         kept = [self._files[path].sha256 for path, whole in self._whole.items() if whole is not None]
         for sha256 in kept:
-            cache.drop(sha256)
+            try:
+                cache.drop(sha256)
+            except OSError as error:
+                cache.report_failure(error)
         return bool(kept)
 
 
