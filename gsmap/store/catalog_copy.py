@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,14 @@ from typing import Any
 from sqlalchemy import Column, Connection, Double, Engine, Integer, MetaData, Table, delete, select, text, update
 from sqlalchemy.types import TypeDecorator
 
-from gsmap.errors import ConfigError, StoreError
+from gsmap.errors import ConfigError, GsmapError, StoreError
 from gsmap.store import catalog as _catalog
 from gsmap.store import migrate, schema, sqlite, trust
 from gsmap.store.catalog import Catalog
 from gsmap.store.error_translation import translate_errors
 from gsmap.store.schema import CHUNK_BOXES
+
+_log = logging.getLogger("gsmap.store")
 
 BATCH_ROWS = 2000  # rows in memory at a time; a pose with covariance takes some kilobytes
 
@@ -55,6 +58,20 @@ def empty_catalog(folder: Path, url: str | None = None, map_id: str = "") -> Cat
         made = Catalog(folder, engine, writable=True)
     migrate.upgrade(made)
     return made
+
+
+def drop_tables(catalog: Catalog) -> None:
+    """Drop the tables of `empty_catalog` from a database whose map could not be made."""
+    try:
+        migrate.upgrade(catalog, "base")
+        with translate_errors(catalog.folder), catalog.engine.begin() as connection:
+            connection.execute(text("DROP TABLE alembic_version"))
+    except GsmapError as error:
+        _log.warning(
+            "the database %r still has the tables of a map that was not made (drop them by hand): %s",
+            catalog.engine.url,
+            error,
+        )
 
 
 def _require_utf8(engine: Engine) -> None:

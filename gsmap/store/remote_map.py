@@ -6,6 +6,7 @@ whenever the map is opened. The mirror can be deleted without loss.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import urllib.parse
@@ -14,11 +15,11 @@ from functools import partial
 from pathlib import Path
 
 from gsmap.durable import write_whole
-from gsmap.errors import ConfigError, CorruptError, NotFoundError
+from gsmap.errors import ConfigError, CorruptError, NotFoundError, of_system
 from gsmap.settings import FILE_NAME as SETTINGS
 from gsmap.store import cache, trust
 from gsmap.store.error_translation import set_display_name
-from gsmap.store.storage import BucketStorage, chunks_of, open_storage
+from gsmap.store.storage import BucketStorage, StorageRequestError, chunks_of, open_storage
 
 _MAX_BYTES = 1 << 20  # of an object that is read whole
 _FILES = (trust.URL_FILE, SETTINGS)
@@ -81,6 +82,10 @@ class RemoteMap:
             NotFoundError: no map exists there.
             CorruptError: an object is too large.
         """
+        with self._translate_errors():
+            self._refresh_mirror()
+
+    def _refresh_mirror(self) -> None:
         self.mirror.mkdir(mode=0o700, parents=True, exist_ok=True)
         (self.mirror / "arrays").mkdir(exist_ok=True)
         for name in _FILES:
@@ -97,8 +102,27 @@ class RemoteMap:
                 write_whole(self.mirror / name, partial(_write, content))
 
     def claim(self, folder: Path) -> bool:
-        """Upload the ``catalog.url`` in a folder, which creates the map; returns False if a map exists there."""
-        return self.storage.put_if_absent(trust.URL_FILE, (folder / trust.URL_FILE).read_bytes())
+        """Upload the ``catalog.url`` in a folder, which creates the map; returns False if a map exists there.
+
+        Raises:
+            StorageRequestError: the storage refused the request or could not be reached; no map was created.
+        """
+        content = (folder / trust.URL_FILE).read_bytes()
+        try:
+            if self.storage.put_if_absent(trust.URL_FILE, content):
+                return True
+        except StorageRequestError:
+            with contextlib.suppress(NotFoundError, StorageRequestError):
+                if self._small(trust.URL_FILE) == content:  # only the response was lost
+                    return True
+            raise
+        try:
+            return self._small(trust.URL_FILE) == content  # sent twice, as the first response was lost
+        except NotFoundError:  # 409 without an object: a conflicting request was under way
+            raise StorageRequestError(
+                f"{self.url}: cannot write ({trust.URL_FILE} conflicts with another request): try again",
+                code="storage_failed",
+            ) from None
 
     def upload_settings(self) -> None:
         """Upload the settings of the mirror."""
@@ -127,9 +151,20 @@ class RemoteMap:
                 f"{self.url} cannot have a file {name!r}; nothing was changed", code="invalid_stored_name"
             )
         target = self.mirror / name
-        if not target.is_file():
-            target.parent.mkdir(exist_ok=True)
-            write_whole(target, lambda staged: _fill(staged, self.storage.get(name)))
+        with self._translate_errors():
+            if not target.is_file():
+                target.parent.mkdir(exist_ok=True)
+                write_whole(target, lambda staged: _fill(staged, self.storage.get(name)))
+
+    @contextlib.contextmanager
+    def _translate_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise of_system(error)(
+                f"cannot write the local mirror of {self.url} in the cache {cache.folder()} "
+                f"({error.strerror or error}): free some space, or set {cache.FOLDER_VARIABLE} to another folder"
+            ) from error
 
     def _small(self, name: str) -> bytes:
         out = b""

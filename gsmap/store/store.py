@@ -25,7 +25,7 @@ from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.backups import Backups
 from gsmap.store.branches import Branches, MapLocation
 from gsmap.store.catalog import Catalog
-from gsmap.store.catalog_copy import empty_catalog, open_sqlite_catalog
+from gsmap.store.catalog_copy import drop_tables, empty_catalog, open_sqlite_catalog
 from gsmap.store.catalog_rows import locate_all
 from gsmap.store.changes import Changes
 from gsmap.store.error_translation import set_display_name, translate_errors
@@ -158,9 +158,13 @@ class Store:
             raise StoreError(f"{path} is a file, but a map needs a folder: choose another name", code="not_a_folder")
         if not folder.parent.is_dir():
             raise NotFoundError(f"cannot make {path}: {folder.parent} does not exist", code="folder_not_found")
-        with translate_errors(folder, "no map was made"), staging.beside(folder) as staged:
+        with (
+            translate_errors(folder, "no map was made"),
+            staging.beside(folder) as staged,
+            contextlib.ExitStack() as undo,
+        ):
             (staged / "arrays").mkdir()
-            _make_catalog(staged, catalog_url)
+            _make_catalog(staged, catalog_url, undo)
             sync_folder(staged)
             try:
                 os.rename(staged, folder)
@@ -168,6 +172,7 @@ class Store:
                 if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                     raise
                 raise StoreError(f"{path} was made by another process meanwhile", code="already_exists") from error
+            undo.pop_all()
             sync_folder(folder.parent)
         if catalog_url is not None:
             trust.trust_new_map(folder)
@@ -453,20 +458,30 @@ def _claim(home: RemoteMap, catalog_url: str | None) -> None:
         raise StoreError(f"{home.url} is a map already: open it, or choose another name", code="already_exists")
     if (found := home.storage.first_name()) is not None:
         raise StoreError(f"{home.url} is not empty (it has {found}): choose another name", code="folder_not_empty")
-    with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
-        _make_catalog(Path(folder), catalog_url)
+    with tempfile.TemporaryDirectory(prefix="gsmap-") as folder, contextlib.ExitStack() as undo:
+        _make_catalog(Path(folder), catalog_url, undo)
         if not home.claim(Path(folder)):
             raise StoreError(
                 f"another process created a map at {home.url} meanwhile: open it, or choose another name",
                 code="already_exists",
             )
+        undo.pop_all()
         trust.trust_new_map(Path(folder))
 
 
-def _make_catalog(folder: Path, url: str | None) -> None:
+def _make_catalog(folder: Path, url: str | None, undo: contextlib.ExitStack) -> None:
+    """Create an empty catalog; ``undo`` empties its database again, so that another map can be made with it."""
     map_id = uuid.uuid4().hex
     made = empty_catalog(folder, url, map_id)
-    with made.write() as connection:
+    with contextlib.closing(made), made.write() as connection:
+        if connection.execute(select(schema.about.c.id)).first() is not None:
+            raise StoreError(
+                f"another process made a map in the database {made.engine.url!r} meanwhile: give each map a database "
+                "of its own",
+                code="database_not_empty",
+            )
         row = {"id": map_id, "created_at": _catalog.now(), "gsmap_version": __version__}
         connection.execute(insert(schema.about), row)
-    made.close()
+    if url is not None:
+        undo.callback(made.close)
+        undo.callback(drop_tables, made)

@@ -1,5 +1,6 @@
 """The same store with its catalog in a real PostgreSQL server."""
 
+import errno
 import stat
 
 import numpy as np
@@ -12,8 +13,8 @@ from store_samples import key, make_cameras, make_gaussians
 from test_store_nouns import graph_of, layer, registration, tile
 
 import gsmap.map
-from gsmap.errors import ConfigError, CorruptError, StoreError
-from gsmap.store import Store, schema, trust
+from gsmap.errors import ConfigError, CorruptError, DiskFullError, StoreError
+from gsmap.store import Store, migrate, schema, trust
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.types import Prior, SceneGraph, Sim3
 
@@ -78,6 +79,35 @@ def test_a_database_whose_texts_are_bytes_is_refused(tmp_path, postgres_url):
     with raises(ConfigError, code="unsupported_encoding"):
         Store.create(tmp_path / "m", catalog_url=postgres_url.format("ascii"))
     assert not (tmp_path / "m").exists()
+
+
+def test_a_map_that_could_not_be_made_leaves_its_database_empty(tmp_path, postgres_database, monkeypatch):
+    def fail(folder):
+        raise OSError(errno.ENOSPC, "no space")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("gsmap.store.store.sync_folder", fail)
+        with raises(DiskFullError, code="disk_full"):
+            Store.create(tmp_path / "m", catalog_url=postgres_database)
+    assert not (tmp_path / "m").exists()
+    with Store.create(tmp_path / "m", catalog_url=postgres_database) as store:
+        assert store.check().ok
+
+
+def test_two_maps_made_at_once_in_one_database(tmp_path, postgres_database, monkeypatch):
+    """The first map stays, though the second found the database empty before."""
+    first = Store.create(tmp_path / "first", catalog_url=postgres_database)
+    with monkeypatch.context() as patched:
+        version = migrate.version
+        seen = iter([None])
+        patched.setattr(migrate, "version", lambda *arguments: next(seen, version(*arguments)))
+        with raises(StoreError, code="database_not_empty"):
+            Store.create(tmp_path / "second", catalog_url=postgres_database)
+    assert not (tmp_path / "second").exists()
+    first.scenes.add(make_gaussians(), make_cameras(), name="a")
+    first.close()
+    with Store.open(tmp_path / "first") as store:
+        assert [scene.name for scene in store.scenes.list()] == ["a"]
 
 
 def test_the_password_stays_out_of_the_map(tmp_path, guarded_database, monkeypatch):

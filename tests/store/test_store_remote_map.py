@@ -1,5 +1,6 @@
 """Maps without a folder: arrays in a real object store that speaks S3, the catalog in a real PostgreSQL server."""
 
+import errno
 import itertools
 import os
 import threading
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from raising import raises
 from store_samples import key, made_change, make_cameras, make_gaussians, save_comparison
-from store_swift import BUCKET, ENVIRONMENT, Wire
+from store_swift import BUCKET, ENVIRONMENT, Wire, refusal
 
 import gsmap.map
 from gsmap.errors import BusyError, ConfigError, CorruptError, NotFoundError, StoreError
@@ -18,7 +19,7 @@ from gsmap.store.backup import clone, restore, save
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.merging import merge
 from gsmap.store.object_arrays import merge_ranges
-from gsmap.store.storage import open_storage
+from gsmap.store.storage import BucketStorage, StorageRequestError, open_storage
 from gsmap.types import Gaussians, NodeLayer, SceneGraph
 
 _numbers = itertools.count()
@@ -73,6 +74,35 @@ def test_a_map_is_made_once_and_needs_a_server(bucket, postgres_database):
     place.put("x", [b"1"], 1)
     with raises(StoreError, code="folder_not_empty"):
         Store.create(place.url, catalog_url=postgres_database)
+
+
+@pytest.mark.parametrize("status", [403, 409, 500])
+def test_a_map_that_could_not_be_made_leaves_its_database_empty(server, bucket, postgres_database, monkeypatch, status):
+    wire = Wire(server.url, faults={"PUT": [refusal(status, "No")] * 9})
+    monkeypatch.setenv("AWS_ENDPOINT_URL", wire.url)
+    with raises(StoreError, code="storage_refused" if status == 403 else "storage_failed"):
+        Store.create(bucket, catalog_url=postgres_database)
+    wire.close()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", server.url)
+    Store.create(bucket, catalog_url=postgres_database).close()
+    with Store.open(bucket) as store:
+        assert store.scenes.list() == []
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_a_map_is_made_though_the_answer_was_lost(bucket, postgres_database, monkeypatch, fails):
+    """Sent again, the request finds its own object."""
+    put = BucketStorage.put_if_absent
+
+    def lose(self, name, content):
+        assert put(self, name, content)
+        if fails:
+            raise StorageRequestError("the answer was lost", code="storage_failed")
+        return False
+
+    monkeypatch.setattr(BucketStorage, "put_if_absent", lose)
+    with Store.create(bucket, catalog_url=postgres_database) as store:
+        assert store.scenes.list() == []
 
 
 def test_what_is_kept_is_read_by_another_machine(home, bucket, tmp_path, monkeypatch, postgres_database):
@@ -141,6 +171,55 @@ def test_what_this_machine_keeps_may_rot(home, tmp_path):
     kept.write_bytes(data[:200] + bytes(100) + data[300:])
     assert same(home.scenes.gaussians("a"), whole)
     assert kept.read_bytes() == data
+
+
+@pytest.mark.parametrize("broken", ["folder", "file", "full", "unreadable"])
+def test_a_broken_cache_stops_no_reading(home, tmp_path, monkeypatch, caplog, broken):
+    home.scenes.add(make_gaussians(), make_cameras(), name="a")
+    whole = home.scenes.gaussians("a")
+    files = tmp_path / "cache" / "files"
+    (kept,) = files.iterdir()
+    if broken == "full":
+        kept.unlink()
+
+        def keep_nothing(root):
+            raise OSError(errno.ENOSPC, "no space")
+
+        monkeypatch.setattr(cache, "make_room", keep_nothing)
+    elif broken == "unreadable":
+        monkeypatch.setattr(cache, "find", lambda sha256: files)
+    else:
+        kept.unlink()
+        if broken == "folder":
+            kept.mkdir()
+        else:
+            files.rmdir()
+            files.touch()
+    for _ in range(2):
+        assert same(home.scenes.gaussians("a"), whole)
+    assert len([r for r in caplog.records if str(tmp_path / "cache") in r.getMessage()]) == 1
+
+
+def test_a_damaged_file_that_stays_in_the_cache_stops_no_reading(home, tmp_path, monkeypatch):
+    home.scenes.add(make_gaussians(), make_cameras(), name="a")
+    whole = home.scenes.gaussians("a")
+    (kept,) = (tmp_path / "cache" / "files").iterdir()
+    kept.write_bytes(kept.read_bytes()[:200])
+
+    def refuse(*arguments):
+        raise OSError(errno.EROFS, "read-only")
+
+    monkeypatch.setattr(cache, "drop", refuse)
+    monkeypatch.setattr(cache, "keep", refuse)
+    assert same(home.scenes.gaussians("a"), whole)
+
+
+def test_a_cache_that_is_no_folder_is_named(home, bucket, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("GSMAP_CACHE", str(tmp_path / "file"))
+    with pytest.raises(StoreError) as caught:
+        Store.open(bucket)
+    assert str(tmp_path / "file") in str(caught.value)
 
 
 def test_prune_and_purge_reclaim_objects(home, tmp_path):

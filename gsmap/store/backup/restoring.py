@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from sqlalchemy import delete, insert, inspect, select, text
+from sqlalchemy import delete, insert, inspect, select
 
 from gsmap.durable import sync_folder
 from gsmap.errors import CorruptError, DiskError, DiskFullError, GsmapError, NotFoundError, StoreError, of_system
@@ -24,8 +24,7 @@ from gsmap.store.backup.map_state import ARRAYS, MapState, OutdatedStateError, c
 from gsmap.store.backup.repository import Backup, Snapshot
 from gsmap.store.backup.saving import TRANSFERS
 from gsmap.store.branches import FOLDER as BRANCHES
-from gsmap.store.catalog import Catalog
-from gsmap.store.catalog_copy import copy_catalog, empty_catalog, make_independent, open_sqlite_catalog
+from gsmap.store.catalog_copy import copy_catalog, drop_tables, empty_catalog, make_independent, open_sqlite_catalog
 from gsmap.store.error_translation import translate_errors
 from gsmap.store.storage import Storage
 from gsmap.store.store import Store
@@ -267,7 +266,7 @@ def _move_catalog(folder: Path, url: str, undo: contextlib.ExitStack) -> MapStat
         with own.read() as connection:
             map_id = connection.execute(select(schema.about.c.id)).scalar_one()
         there = empty_catalog(folder, url, map_id)
-        undo.callback(_drop_tables, there)
+        undo.callback(drop_tables, there)
         with translate_errors(folder):
             copy_catalog(own, there, leave_out=("leases",))
     state = read_state(folder / sqlite.FILE)
@@ -275,20 +274,6 @@ def _move_catalog(folder: Path, url: str, undo: contextlib.ExitStack) -> MapStat
         left.unlink()
     there.engine.dispose()
     return state
-
-
-def _drop_tables(catalog: Catalog) -> None:
-    """Drop the tables from a database whose map was not restored."""
-    try:
-        migrate.upgrade(catalog, "base")
-        with translate_errors(catalog.folder), catalog.engine.begin() as connection:
-            connection.execute(text("DROP TABLE alembic_version"))
-    except GsmapError as error:
-        _log.warning(
-            "the database %r still has the tables of a map that was not restored (drop them by hand): %s",
-            catalog.engine.url,
-            error,
-        )
 
 
 def _require_room(folder: Path, num_bytes: int) -> None:
