@@ -1,4 +1,4 @@
-"""Draw objects of the map, each from the scene that shows most of it."""
+"""Draw objects of the map, each from the best view of the scenes that show most of it."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,7 +26,8 @@ def rejected_places(
     """Return the places by the id of the older scene.
 
     A place counts only if the map claims no other change that overlaps it: the place may have changed between other
-    visits. Changes of the lighting concern no place. A rejection holds although the poses moved since the comparison.
+    visits. Its margin ends where the map claims a change. Changes of the lighting concern no place. A rejection holds
+    although the poses moved since the comparison.
 
     Args:
         comparisons: the current comparison of each pair.
@@ -33,25 +35,31 @@ def rejected_places(
         metres: metric scale of each component.
     """
     rejected: list[tuple[str, int, UnchangedPlace]] = []
-    claimed: list[tuple[int, UnchangedPlace]] = []
+    claimed: dict[int, list[UnchangedPlace]] = {}
     for one in comparisons:
         both = [scenes[scene] for scene in (one.older, one.newer) if scene in placed]
         dated = {scene.id: parse_moment(scene.captured_at) for scene in both if scene.captured_at is not None}
-        if len(dated) < 2:
+        components = {placed[scene].component for scene in dated}
+        if len(dated) < 2 or len(components) > 1:
             continue
-        pose = placed[one.newer]
-        S_map_newer = in_metres(pose.S_map_scene, metres[pose.component].metres_per_unit)
+        (component,) = components
+        S_map_newer = in_metres(placed[one.newer].S_map_scene, metres[component].metres_per_unit)
         S_frame_map = one.S_frame_newer @ S_map_newer.inverse()
         for change in one.changes:
             place = UnchangedPlace(S_frame_map, change.box)
             if change.kind != "lighting" and change.status == "rejected":
-                rejected.append((min(dated, key=dated.__getitem__), pose.component, place))
+                rejected.append((min(dated, key=dated.__getitem__), component, place))
             elif change.kind != "lighting":
-                claimed.append((pose.component, place))
+                claimed.setdefault(component, []).append(place)
+    around = {component: np.array([_box_in_map(place) for place in found]) for component, found in claimed.items()}
     out: dict[str, list[UnchangedPlace]] = {}
     for scene, component, place in rejected:
-        if not any(component == other and _overlap(place, theirs) for other, theirs in claimed):
-            out.setdefault(scene, []).append(place)
+        margin_m = place.margin_m
+        if component in around:
+            near = np.flatnonzero(_gaps(_box_in_map(place), around[component]) < margin_m)
+            margin_m = min((_gap(place, claimed[component][i]) for i in near), default=margin_m)
+        if margin_m >= 0:
+            out.setdefault(scene, []).append(replace(place, margin_m=min(margin_m, place.margin_m)))
     return out
 
 
@@ -60,21 +68,28 @@ def places_near(
 ) -> dict[str, list[UnchangedPlace]]:
     """Return the places within a distance of a tile, by scene id."""
     bounds = tile.bounds * tile.metres_per_unit
-    around = np.array([bounds[0] - within_m, bounds[1] + within_m])
 
     def is_near(place: UnchangedPlace) -> bool:
-        return not tile.is_cut or _meet(moved_box(place.box, place.S_frame_map.inverse()), around)
+        return not tile.is_cut or bool(_gaps(bounds, _box_in_map(place)) < within_m)
 
     near = {scene: [place for place in places.get(scene, ()) if is_near(place)] for scene in tile.poses}
     return {scene: found for scene, found in near.items() if found}
 
 
-def _overlap(a: UnchangedPlace, b: UnchangedPlace) -> bool:
-    """Return whether two places share a volume, the second one as the box around it in the frame of the first."""
+def _box_in_map(place: UnchangedPlace) -> np.ndarray:
+    """Return the box (2, 3) around a place in the map frame."""
+    return moved_box(place.box, place.S_frame_map.inverse())
+
+
+def _gap(a: UnchangedPlace, b: UnchangedPlace) -> float:
+    """Return the gap between two places, the second one as the box around it in the frame of the first."""
     S = a.S_frame_map @ b.S_frame_map.inverse()
     is_same = np.allclose(S.matrix(), np.eye(4), atol=1e-9)
-    return _meet(a.box, b.box if is_same else moved_box(b.box, S))
+    return float(_gaps(a.box, b.box if is_same else moved_box(b.box, S)))
 
 
-def _meet(a: np.ndarray, b: np.ndarray) -> bool:
-    return bool((a[0] < b[1]).all() and (b[0] < a[1]).all())
+def _gaps(box: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the largest gap along an axis between a box (2, 3) and each of others (..., 2, 3); negative if they share
+    a volume."""
+    out: np.ndarray = np.maximum(others[..., 0, :] - box[1], box[0] - others[..., 1, :]).max(-1)
+    return out

@@ -32,7 +32,6 @@ MIN_CAMERAS = 12
 
 _SHOWS = 0.15  # smallest blending weight of disputed Gaussians in a disputed pixel
 _NEAR_M = 0.25  # fragments of a change are searched within this distance of it
-_FRINGE_M = 0.1  # Gaussians of a change lie at most so far outside of its box
 _NEGLIGIBLE_GAIN = 0.02
 _INTRUDES = 0.15  # smallest difference of colour in [0, 1] that a misfit causes in a view
 
@@ -216,10 +215,10 @@ def _find_disagreement(
 
 
 def _inside_any(points: np.ndarray, places: Sequence[UnchangedPlace]) -> np.ndarray:
-    """Return an (N,) mask of points (N, 3) in any of the places, or at most `_FRINGE_M` outside."""
+    """Return an (N,) mask of points (N, 3) in any of the places or its margin."""
     out = np.zeros(len(points), dtype=bool)
     for place in places:
-        out |= inside(place.S_frame_map.apply(points), place.box, _FRINGE_M)
+        out |= inside(place.S_frame_map.apply(points), place.box, place.margin_m)
     return out
 
 

@@ -74,11 +74,11 @@ def is_building_part(
 def _is_cut_out(outline: Outline, is_flat: bool) -> bool:
     """Return whether a segment is hardly shown, or was cut out of a surface that continues around or in front of it."""
     if outline.largest_px < _MIN_SHOWN_PX:
-        return True
+        return outline.largest_px > 0  # a segment that no view looks at may be anything
     hidden = outline.behind_building + outline.behind_segments
     whole = outline.free + outline.touching + outline.continuing + hidden
     stands_out = outline.free >= _MIN_FREE * (outline.free + outline.continuing + outline.behind_building)
-    if whole < _MIN_OUTLINE_PX or (outline.free and stands_out):
+    if whole < _MIN_OUTLINE_PX or outline.continuing + hidden == 0 or (outline.free and stands_out):
         return False
     own = outline.free + outline.touching
     return not is_flat or own < _MIN_OWN * whole or hidden > _MAX_HIDDEN * whole

@@ -47,6 +47,7 @@ class _CheckedText(TypeDecorator[Any]):
     impl = Text
     cache_ok = True
     what = "a text"
+    is_required = False
 
     def __init__(self, where: str = "") -> None:
         super().__init__()
@@ -68,10 +69,10 @@ class _CheckedText(TypeDecorator[Any]):
 
     def result_processor(self, dialect: Any, coltype: Any) -> Callable[[Any], Any] | None:
         # Instead of `process_result_value`: with millions of values, a wrapper call would take half of the time.
-        is_valid, where, what = self.is_valid, self.where, self.what
+        is_valid, where, what, is_required = self.is_valid, self.where, self.what, self.is_required
 
         def checked(value: Any) -> Any:
-            if value is None or (isinstance(value, str) and is_valid(value)):
+            if (value is None and not is_required) or (isinstance(value, str) and is_valid(value)):
                 return value
             raise corrupt_value(where, value, what)
 

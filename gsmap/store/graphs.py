@@ -59,7 +59,7 @@ class Graphs:
         self._catalog = catalog
         self._arrays = arrays
         self._rows = RowIndexMaps(catalog, arrays)
-        self._listed: dict[tuple[str, str], StoredGraph] = {}  # by key and array group; cached, since neither changes
+        self._listed: dict[tuple[Any, ...], StoredGraph] = {}  # by number, key, array group and time of the row
 
     def save(self, graph: SceneGraph, key: RecipeKey) -> StoredGraph:
         """Store a graph in place of one with the same key; saving the same graph again repairs its damaged arrays.
@@ -200,16 +200,17 @@ class Graphs:
 
         Parsed rows are cached, because an update needs them several times.
         """
-        names = (type_coerce(GRAPHS.c.key, Text), type_coerce(GRAPHS.c.group_id, Text))  # to be compared with
-        living = GRAPHS.select(*names).join(scenes, scenes.c.id == GRAPHS.c.scene)
+        key, group_id = (type_coerce(column, Text) for column in (GRAPHS.c.key, GRAPHS.c.group_id))  # only compared
+        named = GRAPHS.select(GRAPHS.c.number, key, group_id, GRAPHS.c.created_at)
+        living = named.join(scenes, scenes.c.id == GRAPHS.c.scene)
         query = living.where(scenes.c.removed_at.is_(None)).order_by(GRAPHS.c.created_at)
         with self._catalog.read() as connection:
-            wanted = [(key, group_id) for key, group_id in connection.execute(query).all()]
-            new = sorted(key for key, group_id in wanted if (key, group_id) not in self._listed)
+            wanted = [tuple(row) for row in connection.execute(query).all()]
+            new = [row[0] for row in wanted if row not in self._listed]
             if new:
-                some = GRAPHS.c.key.in_(new) if len(new) <= recipes.MAX_NAMED_KEYS else true()
+                some = GRAPHS.c.number.in_(new) if len(new) <= recipes.MAX_NAMED_KEYS else true()
                 for row in connection.execute(GRAPHS.select().where(some)).all():
-                    self._listed[row.key, row.group_id] = _stored(row)
+                    self._listed[row.number, row.key, row.group_id, row.created_at] = _stored(row)
         return [self._listed[one] for one in wanted]
 
 

@@ -22,7 +22,7 @@ from gsmap.store.schema import lookups
 from gsmap.types.retrieval import Candidate, IndexArrays, IndexedScene
 
 KIND = "indexes"
-_SEGMENTS = ResultRows(KIND, is_index_segment)
+_SEGMENTS = ResultRows(KIND, is_index_segment, required=("group_id",))
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,9 +32,10 @@ from gsmap.types.plain import plain
 ObjectBoxes = Mapping[str, np.ndarray]
 """Boxes (2, 3) of an object in the scene frame, by scene id."""
 
+SETS = ResultRows("objects", is_object_set, required=("scenes",))
+
 # Minimum intersection over union of the boxes of one object in two computations, each padded by a fraction of the
 # larger one's diagonal because the box of a picture on a wall has almost no thickness.
-SETS = ResultRows("objects", is_object_set)
 _MIN_OVERLAP = 0.1
 _PAD = 0.03
 

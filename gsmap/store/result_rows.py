@@ -3,10 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Delete, MetaData, Select, Table, delete, insert, select
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Delete,
+    MetaData,
+    Select,
+    Table,
+    Text,
+    delete,
+    insert,
+    select,
+    type_coerce,
+)
 
 from gsmap.methods import RecipeKey
 from gsmap.store.catalog import now
@@ -21,17 +33,22 @@ class ResultRows:
     Args:
         kind: name of the kind, and of its array groups.
         is_valid: condition that the metadata of each row meets.
+        required: columns that are not null in rows of this kind.
 
     Attributes:
         c: columns of the table.
     """
 
-    def __init__(self, kind: str, is_valid: Callable[[Any], bool]) -> None:
+    def __init__(
+        self, kind: str, is_valid: Callable[[Any], bool], required: Sequence[str] = ("scene", "group_id")
+    ) -> None:
         self.kind = kind
         columns = result_columns(is_valid)
         for column in columns:
             if hasattr(column.type, "for_column"):
-                column.type = column.type.for_column(f"results.{column.name} of {kind}")
+                made: Any = column.type.for_column(f"results.{column.name} of {kind}")
+                made.is_required = column.name in required
+                column.type = made
         self._table = Table(results.name, MetaData(), *columns)
         self.c = self._table.c
 
@@ -58,7 +75,8 @@ GRAPHS = ResultRows("graphs", is_graph)
 
 def delete_results_of(connection: Connection, scene: str) -> Counter[str]:
     """Delete the results that were computed from a scene, alone or with others; return their numbers by kind."""
-    computed_from_it = (results.c.scene == scene) | results.c.scenes.contains(scene)
+    named = results.c.scenes.contains(scene) | type_coerce(results.c.about, Text).contains(scene)
+    computed_from_it = (results.c.scene == scene) | (results.c.scene.is_(None) & named)
     counts = Counter(connection.execute(select(results.c.kind).where(computed_from_it)).scalars())
     connection.execute(delete(results).where(computed_from_it))
     return counts

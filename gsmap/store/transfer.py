@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from sqlalchemy import Connection, Row, delete, insert, select, update
 
 from gsmap.durable import open_file, write_whole
-from gsmap.errors import ConfigError, StoreError
+from gsmap.errors import ConfigError, CorruptError, StoreError
 from gsmap.store import facts
 from gsmap.store.array_groups import forget_derived, has_group, manifest, name, publish
 from gsmap.store.arrays import StagedGroup, StoredFile, link_or_copy
@@ -74,10 +74,15 @@ def open_transfer(
                 theirs = stack.enter_context(source.catalog.read())
                 with into.catalog.read() as ours:
                     missing, derived = _missing_groups(into, ours, theirs, only, mend)
-                lost = {group for group in derived if source.arrays.problems(*group, missing[group])}
-                missing = {group: files for group, files in missing.items() if group not in lost}
-                damaged = {group for _, group in lost}
-                staged = stack.enter_context(into.arrays.stage_copies(source.arrays, missing))
+                try:
+                    staged = stack.enter_context(into.arrays.stage_copies(source.arrays, missing))
+                except CorruptError:
+                    lost = {group for group in derived if source.arrays.problems(*group, missing[group])}
+                    if not lost:
+                        raise
+                    damaged = {group for _, group in lost}
+                    sound = {group: files for group, files in missing.items() if group not in lost}
+                    staged = stack.enter_context(into.arrays.stage_copies(source.arrays, sound))
         ours = stack.enter_context(into.catalog.write())
         into.catalog.hold_until_commit(into.arrays.lock())
         if same_home:
@@ -246,6 +251,12 @@ class Transfer:
         staged = None if self._staged is None or group is None else self._staged.pop((kind, group), None)
         if group is None or (staged is None and has_group(self.ours, group)):
             return
+        of_kind = select(groups.c.kind).where(groups.c.id == group)
+        if self.theirs.execute(of_kind).scalar() != kind:
+            raise CorruptError(
+                f"{self.source.location}: the arrays {group[:12]} are not of the kind {kind}; nothing was changed",
+                code="catalog_invalid",
+            )
         files = manifest(self.theirs, group)
         if self._staged is None:
             name(self.ours, kind, group, files)  # of the same map: the group exists already
@@ -289,6 +300,7 @@ class Transfer:
             if not is_known:
                 self.recipe(row.recipe)
                 self.ours.execute(insert(results), _content(row))
+                has_one.add((row.kind, row.scene))
                 self.counts[row.kind] += 1
 
     def recipe(self, digest: str | None) -> None:

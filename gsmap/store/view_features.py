@@ -81,7 +81,7 @@ def _shapes(about: Mapping[str, int]) -> dict[str, Shape]:
 
 def _features(row: Row[Any], arrays: dict[str, np.ndarray]) -> SceneFeatures:
     starts = arrays["starts"]
-    if starts[0] != 0 or starts[-1] != row.num_items or (np.diff(starts) < 0).any():
+    if starts[0] != 0 or starts[-1] != len(arrays["points"]) or (np.diff(starts) < 0).any():
         raise InputError("its views do not partition its features", code="invalid_record")
     if not np.isfinite(arrays["points"]).all():
         raise InputError("a point holds NaN or infinity", code="not_finite")

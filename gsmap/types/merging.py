@@ -20,10 +20,12 @@ class UnchangedPlace:
     Args:
         S_frame_map: transforms the map frame, in metres, to the frame of the box.
         box: (2, 3) lowest and highest corner, in metres.
+        margin_m: distance around the box in which Gaussians belong to the place, too.
     """
 
     S_frame_map: Sim3
     box: np.ndarray
+    margin_m: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,9 +71,10 @@ class SegmentedViews:
         scores, areas = np.stack([self._scores(small[int(view)], points, of, count) for view in chosen], axis=1)
         scores *= np.sqrt(areas / np.maximum(areas.max(0), 1e-12))
         out: list[BestView | None] = []
+        starts = np.searchsorted(of, np.arange(count + 1))  # points are sorted by segment
         for segment, view in enumerate(np.argmax(scores, axis=0)):
             camera, score = int(chosen[view]), float(scores[view, segment])
-            box = _box_in(small[camera], points[of == segment])
+            box = _box_in(small[camera], points[starts[segment] : starts[segment + 1]])
             out.append(BestView(score, camera, box) if score > 0 else None)
         return out
 

@@ -14,6 +14,7 @@ from gsmap.merge.changes import resolve_changes
 from gsmap.merge.exposure import apply_gain
 from gsmap.merge.mergers import tto
 from gsmap.merge.references import render_references
+from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.render import render
 from gsmap.types import Gaussians, Sim3
 from gsmap.types.merging import UnchangedPlace
@@ -56,6 +57,23 @@ def test_nothing_is_outdated_where_the_changes_were_rejected():
     bare, boxed = dated("old", 2020, wall(0, -1.5, 1.5)), dated("new", 2021, wall(1, -1.5, 1.5), box(5))
     once = replace(boxed, cameras=cameras_facing([0.0], distance=3.6))
     assert resolve_changes([replace(bare, unchanged=around), once], "best").num_removed == [0, 0]
+
+
+@pytest.mark.parametrize("bounds", [None, np.array([[-1.0, -1, -2], [1, 1, 1]])])
+def test_a_tile_keeps_what_stands_in_a_rejected_place(bounds):
+    old, new = dated("old", 2020, wall(0, -1.5, 1.5), box(5)), dated("new", 2021, wall(1, -1.5, 1.5))
+    around = UnchangedPlace(Sim3.identity(), np.array([[-0.2, -0.15, -0.5], [0.2, 0.15, -0.5]]))
+
+    def merged(*unchanged):
+        lazy = [
+            LazyScene(s.scene_id, Sim3.identity(), lambda _, s=s: s.gaussians, s.cameras, s.captured_at)
+            for s in (old, new)
+        ]
+        lazy[0] = replace(lazy[0], unchanged=unchanged)
+        params = replace(default_params("union"), prefer="newest")
+        return int((merge_tile(lazy, "union", params, bounds=bounds).gaussians.means[:, 2] < -0.3).sum())
+
+    assert (merged(), merged(around)) == (0, len(box(5)))
 
 
 def test_an_older_capture_in_another_exposure_loses_no_more_beside_what_went():

@@ -92,6 +92,8 @@ def test_rooms_corners_trims_and_debris_are_none(name, points):
         (Outline(20, 10, 10, 0, 60, 900), False, False),  # behind other objects
         (Outline(2, 2, 9, 0, 0, 900), False, False),  # too short to judge
         (Outline(60, 30, 10, 0, 0, 12), True, True),  # nearly invisible
+        (Outline(0, 0, 0, 0, 0, 0), False, False),  # no view looks at it
+        (Outline(0, 300, 0, 0, 0, 900), False, False),  # stands among other things
     ],
 )
 def test_what_is_cut_out_of_a_surface_is_a_part_of_the_building(outline, solid, flat):

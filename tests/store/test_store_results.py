@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from raising import raises
+from sqlalchemy import update
 from store_samples import key, make_cameras, make_gaussians
 
 from gsmap.errors import CorruptError, InputError
 from gsmap.store import Store, merging, purging
 from gsmap.store.backup import restoring
+from gsmap.store.column_types import is_object_set
+from gsmap.store.result_rows import ResultRows
 from gsmap.store.results import DerivedArrays
+from gsmap.store.schema import results
 from gsmap.store.sizes import sizes
 from gsmap.types import Scene, SceneGraph
 
@@ -57,6 +62,7 @@ def test_it_is_read_as_it_was_saved_and_listed(store: Store, scene: Scene) -> No
     assert {one.kind: one.count for one in sizes(store)}["colours"] == 1
     assert store.view_features.stored_keys([key("colours", scene.id)]) == set()  # another kind
     assert store.graphs.find(key("colours", scene.id)) is None
+    assert store.graphs.stored_keys([key("colours", scene.id)]) == set()
     with raises(InputError, code="key_input_mismatch"):
         colours.put(scene.id, key("colours"), {"mean": GREY[None]}, num_items=1)
 
@@ -119,7 +125,9 @@ def test_it_goes_with_its_scene(store: Store, scene: Scene) -> None:
 
 
 def test_a_purge_counts_and_erases_it(store: Store, scene: Scene) -> None:
+    restoring.clone(store, store.home.with_name("clone.gsmap"))  # shares files with the map
     done = purging.finish(store, purging.begin(store, scene.id), ())
+    assert done.receipt["linked_files"] == 2  # the scene's, and this one
     assert done.receipt["rows"]["colours"] == 1
     assert groups(store) == []
 
@@ -136,3 +144,26 @@ def test_damage_is_found_and_forgotten(store: Store, scene: Scene) -> None:
     assert MeanColours(store).load(scene.id) is None
     store.prune()
     assert store.check().ok
+
+
+@pytest.mark.parametrize("column", ["scene", "group_id"])
+def test_rows_without_a_scene_or_arrays_are_refused(store: Store, scene: Scene, column: str) -> None:
+    store.graphs.save(SceneGraph(scene.id, {}, None, 2.0), key("describe", scene.id))
+    with store.catalog.write() as connection:
+        connection.execute(update(results).values({column: None}))
+    for read in (store.graphs.list, lambda: store.graphs.damaged([key("describe", scene.id)])):
+        with contextlib.suppress(CorruptError):  # a row of no scene is found by no other means
+            assert not read()
+    if column == "group_id":
+        with raises(CorruptError, code="catalog_invalid"):
+            MeanColours(store).load(scene.id)
+
+
+def test_a_purge_finds_what_only_its_metadata_names(store: Store, scene: Scene) -> None:
+    poses = {scene.id: {"rotation": np.eye(3).tolist(), "translation": [0, 0, 0], "scale": 1.0}}
+    with store.catalog.write() as connection:
+        ResultRows("objects", is_object_set).insert(connection, key="0" * 32, num_items=0, about={"poses": poses})
+    with raises(CorruptError, code="catalog_invalid"):
+        store.objects.sets()
+    purging.finish(store, purging.begin(store, scene.id), ())
+    assert store.objects.sets() == []

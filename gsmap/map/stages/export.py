@@ -257,7 +257,8 @@ def _digest(kept: Sequence[StoredPhoto]) -> str:
 
 def _digest_places(places: Mapping[str, Sequence[UnchangedPlace]]) -> str:
     """Return a digest of boxes in their own frames; where these lie follows from the poses."""
-    return text_digest(canonical({scene: [plain(place.box) for place in of] for scene, of in places.items()}))[:32]
+    rows = {scene: [[place.box, place.margin_m] for place in found] for scene, found in places.items()}
+    return text_digest(canonical(plain(rows)))[:32]
 
 
 def export(
