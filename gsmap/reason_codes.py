@@ -178,6 +178,7 @@ ERRORS: Final[Mapping[str, str]] = {
     "no_embeddings": "The map's scene graphs have no embeddings.",
     "not_a_model": "A file is not an ONNX model.",
     # Workers.
+    "map_not_on_worker": "A Dask worker cannot see the map at its path.",
     "scheduler_lost": "The connection to the Dask scheduler was lost.",
     "scheduler_unreachable": "The Dask scheduler cannot be reached.",
     "worker_mismatch": "A Dask worker has another version of gsmap.",

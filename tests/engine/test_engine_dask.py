@@ -94,6 +94,53 @@ def test_nothing_is_lost_with_a_worker(workers: Any, cluster: Any) -> None:
     assert sorted(found) == [(i, i) for i in range(60)], "each once"
 
 
+def test_a_worker_of_another_version_gives_no_result(workers: Any, cluster: Any) -> None:
+    with distributed.Client(cluster, set_as_default=False) as client:
+        address = next(iter(client.scheduler_info()["workers"]))
+        before = client.run(dask_jobs.set_version, "0.9.0", workers=[address])[address]
+        try:
+            with raises(GsmapError, code="worker_mismatch") as error:
+                for index, value in workers.run(dask_jobs.nap, [(i, 0.05) for i in range(40)]):
+                    assert value == index, "from the other worker"
+            assert all(text in str(error.value) for text in (address, "0.9.0", before))
+        finally:
+            client.run(dask_jobs.set_version, before, workers=[address])
+        assert dict(workers.run(dask_jobs.square, [(3,)])) == {0: 9}
+
+
+def test_a_worker_whose_version_compares_none_is_a_mismatch(workers: Any, cluster: Any) -> None:
+    with distributed.Client(cluster, set_as_default=False) as client:
+        client.run(dask_jobs.set_signature_of_older_version)
+        try:
+            with raises(GsmapError, code="worker_mismatch"):
+                list(workers.run(dask_jobs.square, [(1,)]))
+        finally:
+            client.run(dask_jobs.restore_signature)
+
+
+def test_a_map_that_only_this_machine_sees_is_said_to_be_unseen_by_the_workers(workers: Any, tmp_path: Path) -> None:
+    with raises(GsmapError, code="map_not_on_worker", match=workers._address):
+        list(workers.run(dask_jobs.open_map, [(str(tmp_path / "unseen.gsmap"),)]))
+
+
+def test_a_cluster_without_workers_is_waited_for_with_one_warning(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("gsmap.engine.executors.dask._WARN_AFTER_S", 0.5)
+    monkeypatch.setattr("gsmap.engine.executors.dask._POLL_S", 0.1)
+    with distributed.LocalCluster(n_workers=0, threads_per_worker=1, processes=False, dashboard_address=None) as empty:
+        address = empty.scheduler_address
+        late = threading.Timer(2.0, empty.scale, [1])
+        late.start()
+        waiting = start(Params(scheduler=address))
+        assert dict(waiting.run(dask_jobs.square, [(i,) for i in range(3)])) == {0: 0, 1: 1, 2: 4}
+        waiting.close()
+        late.join()
+    warned = [record.getMessage() for record in caplog.records if record.name == "gsmap.engine"]
+    assert len(warned) == 1
+    assert address in warned[0]
+
+
 def test_no_scheduler_is_an_error_that_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("GSMAP_SCHEDULER", raising=False)
     with raises(ConfigError, code="missing_option", match="scheduler="):

@@ -6,6 +6,7 @@ fetched at once and committed to the map's catalog. So any part of the cluster m
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import pickle
@@ -18,8 +19,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from gsmap.engine.worker import answer
-from gsmap.errors import ConfigError, GsmapError, MissingDependencyError
+from gsmap.errors import ConfigError, GsmapError, MissingDependencyError, NotFoundError
 from gsmap.methods.executor import QuarantinedJob
+from gsmap.version import __version__
 
 VERSION = 1
 
@@ -28,8 +30,10 @@ _ATTEMPTS = 2
 
 _BEGUN = "gsmap-begun"  # metadata key of the number of attempts
 _POLL_S = 1.0  # interval at which the number of workers is read
+_WARN_AFTER_S = 10.0  # time without workers after which a warning is logged
 _AHEAD = 0.25  # jobs submitted beyond one for each thread of the workers, as a fraction of these
 _MIN_SUBMITTED = 4  # jobs submitted however few workers there are, so that a cluster that grows on demand sees some
+_log = logging.getLogger("gsmap.engine")
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,8 @@ class DaskWorkers:
     def __init__(self, address: str, params: Params) -> None:
         self._address, self._params = address, params
         self._client: Any = None
+        self._alone_since: float | None = None  # time at which the cluster was first seen without workers
+        self._warned = False
 
     def run(
         self, job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], *, quick: bool = False
@@ -71,7 +77,7 @@ class DaskWorkers:
 
         def submit(index: int, message: bytes) -> None:
             key = f"gsmap-{run}-{index}"
-            future = client.submit(do, run, key, message, key=f"{key}-{uuid.uuid4().hex[:8]}", pure=False)
+            future = client.submit(do, run, key, message, __version__, key=f"{key}-{uuid.uuid4().hex[:8]}", pure=False)
             running[future] = index, message
             future.add_done_callback(done.put)
 
@@ -96,7 +102,7 @@ class DaskWorkers:
                     continue
                 returned, value = result
                 if not returned:
-                    raise value
+                    raise self._explained(value)
                 yield index, value
         finally:
             self._forget(run, list(running))
@@ -129,7 +135,30 @@ class DaskWorkers:
             threads = sum(self._client.nthreads().values())
         except Exception as error:  # a lost connection may raise anything
             raise self._lost() from error
+        self._warn_of_no_workers(threads)
         return max(threads + math.ceil(_AHEAD * threads), _MIN_SUBMITTED)
+
+    def _warn_of_no_workers(self, threads: int) -> None:
+        """Log one warning after the cluster has had no workers for some time."""
+        if threads:
+            self._alone_since, self._warned = None, False
+            return
+        now = time.monotonic()
+        self._alone_since = now if self._alone_since is None else self._alone_since
+        if not self._warned and now - self._alone_since >= _WARN_AFTER_S:
+            self._warned = True
+            _log.warning("waiting for workers of %s; each needs gsmap %s", self._address, __version__)
+
+    def _explained(self, error: BaseException) -> BaseException:
+        """Return the error of a job, or the cause of an error that would mislead on this machine."""
+        if getattr(error, "code", None) != "map_not_found":
+            return error
+        explained = NotFoundError(
+            f"a worker of {self._address} cannot see the map: mount it there under the same path",
+            code="map_not_on_worker",
+        )
+        explained.__cause__ = error
+        return explained
 
     def _result(self, future: Any) -> tuple[bool, Any] | None:
         """Return (True, value) or (False, error) of a job; None if the job must be submitted again.
@@ -149,7 +178,7 @@ class DaskWorkers:
             if self._client is None or self._client.status != "running":
                 raise self._lost() from error
             return None
-        except (ImportError, pickle.UnpicklingError) as error:
+        except (ImportError, pickle.UnpicklingError, TypeError) as error:  # TypeError: another signature of `do`
             raise GsmapError(
                 f"a worker of {self._address} could not load its job ({error}): install the same version of gsmap "
                 "there",
@@ -185,12 +214,28 @@ def start(params: Params) -> DaskWorkers:
     return DaskWorkers(address, params)
 
 
-def do(run: str, key: str, message: bytes) -> bytes:
-    """Run a job on a worker and return its compressed result; do not run a job that killed its workers twice."""
+def do(run: str, key: str, message: bytes, version: str) -> bytes:
+    """Run a job on a worker and return its compressed result; do not run a job that killed its workers twice.
+
+    Args:
+        version: version of gsmap that submitted the job; the result is an error if the worker has another one, whose
+            results would differ.
+    """
     from distributed import get_worker
     from distributed.utils import sync
 
     worker = get_worker()
+
+    def packed(returned: bool, value: Any) -> bytes:
+        return zlib.compress(pickle.dumps((returned, value)), 1)
+
+    if version != __version__:
+        mismatch = GsmapError(
+            f"the Dask worker at {worker.address} has gsmap {__version__}, but this is gsmap {version}: install the "
+            "same version there",
+            code="worker_mismatch",
+        )
+        return packed(False, mismatch)
 
     def begun(times: int | None = None) -> int:
         """Return the job's number of attempts from the scheduler, or set it to ``times``."""
@@ -204,8 +249,8 @@ def do(run: str, key: str, message: bytes) -> bytes:
     before = begun()
     if before >= _ATTEMPTS:
         reason = f"{before} workers that tried the job died, most likely for lack of memory"
-        return zlib.compress(pickle.dumps((True, QuarantinedJob(reason))), 1)
+        return packed(True, QuarantinedJob(reason))
     begun(before + 1)
-    packed = zlib.compress(answer(message), 1)
+    result = zlib.compress(answer(message), 1)
     begun(0)  # losses from now on do not count as attempts
-    return packed
+    return result
