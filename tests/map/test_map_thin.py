@@ -10,7 +10,7 @@ import pytest
 from raising import raises
 
 import gsmap.map
-from gsmap.errors import ConfigError
+from gsmap.errors import ConfigError, StoreError
 from gsmap.map import Map
 from gsmap.methods import RecipeKey
 from gsmap.types import PoseGraph, ScenePose, Sim3
@@ -85,6 +85,32 @@ def test_no_capture_stands_for_one_of_another_component(tmp_path):
         (after,) = m.thin(keep_days=3200, now=NOW).scenes
         assert (after.seen_again, after.thinned) == (0.0, False)
         assert all(scene.thinning is None for scene in m.scenes())
+
+
+@pytest.mark.guards("data")
+@pytest.mark.parametrize("change", ["removed", "thinned", "dated", "unplaced"])
+def test_nothing_is_thinned_for_a_capture_that_changes_meanwhile(tmp_path, change):
+    """The newest stands for the others; it changes after w0 is thinned."""
+
+    def disturb(stage, fraction, text):
+        if text != "w1" or fraction < 0.5:
+            return
+        with gsmap.map.open(tmp_path / "m.gsmap") as other:
+            if change == "removed":
+                other.remove("w2")
+            elif change == "thinned":
+                other.store.scenes.thin("w2", np.ones(other["w2"].num_gaussians, bool))
+            elif change == "dated":
+                other.edit("w2", captured_at="2019-06-01")
+            else:
+                other.store.revisions.save(PoseGraph({}, {}), RecipeKey("optimize", "none", {}, {}, ""))
+
+    with walls(tmp_path / "m.gsmap", [0.0, 0.0, 0.0]) as m:
+        m._progress = disturb
+        with raises(StoreError, code="changed_meanwhile"):
+            m.thin(keep_days=0, now=NOW)
+        others = {scene.name: scene.thinning is not None for scene in m.scenes() if scene.name != "w2"}
+        assert others == {"w0": True, "w1": False}
 
 
 @pytest.mark.parametrize("unit", [0.1, 10.0])

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 
 from gsmap.compare import CaptureViews
-from gsmap.errors import ConfigError, NotFoundError
+from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.geometry.metric_scale import in_metres
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map.metric_scales import metres_of_scenes
@@ -52,15 +52,17 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
     Raises:
         ConfigError: neither days nor a budget, or negative ones; the clock contradicts what is stored.
         NotFoundError: the map has no poses.
+        StoreError: another process changed the poses or a capture that stays; captures thinned before stay thinned.
     """
     if request.keep_days is None and request.budget_bytes is None:
         raise ConfigError("pass --keep-days DAYS, --budget SIZE, or both", code="nothing_requested")
     if not (request.keep_days or 0) >= 0 or (request.budget_bytes or 0) < 0:
         raise ConfigError("days and sizes must not be negative", code="out_of_range")
-    graph = store.revisions.get()
+    with store.catalog.read():
+        revision, graph = store.revisions.newest_number(), store.revisions.get()
+        living = {scene.id: scene for scene in store.scenes.list()}
     if graph is None:
         raise NotFoundError("the map has no poses yet: run gsmap update first", code="no_poses")
-    living = {scene.id: scene for scene in store.scenes.list()}
     dated = sorted((s for s in living.values() if s.captured_at is not None), key=_when)
     try:
         now = _present(store, dated) if request.now is None else _moment(request.now)
@@ -76,7 +78,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
     of_scenes, of_graphs = scene_sizes(store), graph_sizes(store)
     sizes = {scene: of_scenes.get(scene, 0) + of_graphs.get(scene, 0) for scene in living}
     ups = {graph.scene: graph.up for graph in store.graphs.list()}  # of the newest graph
-    shares = _superseded(store, known, before, graph, settings, progress)
+    shares, stay = _superseded(store, known, before, graph, settings, progress)
     why = reason("pose_unconfirmed", "its pose is not confirmed: gsmap list MAP scenes shows its status")
     rows = [_row(scene, sizes[scene.id], sizes[scene.id], 0.0, why) for scene in doubtful]
     with note_interruption(lambda: f"{sum(row.thinned for row in rows)} captures are thinned"):
@@ -101,6 +103,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
             if not request.dry_run:
                 described = store.graphs.load(scene.id)
                 with store.transaction():
+                    _require_unchanged(store, revision, [scene, *stay])
                     store.scenes.thin(scene.id, stays, up=ups.get(scene.id))
                     _keep_things(store, described)
                 after = _num_bytes(store, scene.id)
@@ -151,6 +154,28 @@ def _keep_things(store: Store, graph: SceneGraph | None) -> None:
     store.graphs.save(replace(graph, layers={}), THINGS.of(graph.scene_id))
 
 
+def _require_unchanged(store: Store, revision: int | None, decided: Sequence[Scene]) -> None:
+    """Raise `StoreError` inside a transaction if another process has changed what a thinning was decided on.
+
+    Args:
+        revision: number of the newest revision when it was decided.
+        decided: the scene to thin and the scenes that stay whole, as they were then.
+    """
+    now = {scene.id: scene for scene in store.scenes.list()}
+    changed = [
+        scene.name
+        for scene in decided
+        if (found := now.get(scene.id)) is None or found.thinning is not None or found.captured_at != scene.captured_at
+    ]
+    if changed:
+        what = f"removed, thinned or edited {', '.join(changed[:3])}"
+    elif store.revisions.newest_number() != revision:
+        what = "changed the poses"
+    else:
+        return
+    raise StoreError(f"another process {what} meanwhile: run the same command again", code="changed_meanwhile")
+
+
 def _superseded(
     store: Store,
     known: Sequence[Scene],
@@ -158,8 +183,10 @@ def _superseded(
     graph: PoseGraph,
     settings: Settings,
     progress: StageProgress,
-) -> dict[str, float]:
+) -> tuple[dict[str, float], list[Scene]]:
     """Return the fraction of each old scene's surface that newer, whole scenes observed, by scene id.
+
+    Also return the scenes that stay whole.
 
     Decided from the newest back, so that no capture is superseded by one that is thinned itself. What was thinned
     before needs others to stand for it still: where those that stay do not, further ones must.
@@ -202,7 +229,7 @@ def _superseded(
             shares[scene.id] = share(scene)
             if shares[scene.id] < bar:
                 stay.append(scene)
-    return shares
+    return shares, stay
 
 
 def _row(scene: Scene, before: int, after: int, seen: float, why: str, fidelity: float | None = None) -> ThinRow:
