@@ -72,7 +72,7 @@ def unless_pruned(catalog: Catalog, group_id: str, gone: str) -> Iterator[None]:
     try:
         yield
     except CorruptError:
-        with catalog.read() as connection:
+        with catalog.read(newest=True) as connection:
             if has_group(connection, group_id):
                 raise
         raise NotFoundError(

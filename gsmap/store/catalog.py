@@ -90,12 +90,16 @@ class Catalog:
         return getattr(self._thread, "connection", None)
 
     @contextlib.contextmanager
-    def read(self) -> Iterator[Connection]:
+    def read(self, *, newest: bool = False) -> Iterator[Connection]:
         """Open a snapshot read: a transaction that sees one state of the map, whatever other processes write.
 
         Inside another transaction of the same thread it joins that one.
+
+        Args:
+            newest: see the newest state even inside an older snapshot.
         """
-        within = self._writing or getattr(self._thread, "reading", None)
+        snapshot = getattr(self._thread, "reading", None)
+        within = self._writing or (None if newest else snapshot)
         if within is not None:
             yield within
             return
@@ -104,7 +108,7 @@ class Catalog:
             try:
                 yield connection
             finally:
-                self._thread.reading = None
+                self._thread.reading = snapshot
 
     @contextlib.contextmanager
     def _reading(self) -> Iterator[Connection]:

@@ -5,7 +5,7 @@ import pytest
 from raising import raises
 from store_samples import key, made_change, make_cameras, make_gaussians, save_comparison
 
-from gsmap.errors import NotFoundError
+from gsmap.errors import CorruptError, NotFoundError
 from gsmap.map import reports
 from gsmap.store import Store
 from gsmap.types import SceneGraph
@@ -82,11 +82,43 @@ def test_a_comparison_that_is_pruned_while_it_is_read_is_not_called_damaged(stor
         store.changes.load(kept.number)
 
 
-def prune_when_read(store, monkeypatch):
+def read_in_snapshot(store, monkeypatch, url=None):
+    add(store, 1)
+    prune_when_read(store, monkeypatch, url)
+    with store.catalog.read():
+        with raises(NotFoundError, code="changed_meanwhile"):
+            store.scenes.gaussians("scene1")
+        assert [scene.name for scene in store.scenes.list()] == ["scene1"], "still the snapshot"
+    assert not store.scenes.list()
+
+
+@pytest.mark.guards("data")
+def test_arrays_that_are_pruned_during_a_snapshot_are_not_called_damaged_on_sqlite(store, monkeypatch):
+    read_in_snapshot(store, monkeypatch)
+
+
+@pytest.mark.guards("data")
+def test_arrays_that_are_pruned_during_a_snapshot_are_not_called_damaged_on_postgres(
+    tmp_path, postgres_database, monkeypatch
+):
+    with Store.create(tmp_path / "m", catalog_url=postgres_database) as store:
+        read_in_snapshot(store, monkeypatch, postgres_database)
+
+
+@pytest.mark.guards("data")
+def test_damaged_arrays_are_called_damaged_in_a_snapshot(store):
+    add(store, 1)
+    for file in (store.folder / "arrays").rglob("arrays.zip"):
+        file.unlink()
+    with store.catalog.read(), raises(CorruptError, code="arrays_missing"):
+        store.scenes.gaussians("scene1")
+
+
+def prune_when_read(store, monkeypatch, url=None):
     real = store.arrays.read
 
     def after_a_prune(*args, **options):
-        with Store.open(store.folder) as other:
+        with Store.open(store.folder, catalog_url=url) as other:
             other.scenes.remove("scene1")
             other.prune()
         return real(*args, **options)
