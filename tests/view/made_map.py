@@ -274,7 +274,7 @@ class MadeServer:
                     "picture": None,
                     "size_m": [40, 20],
                     "P_plan_map": [[1 / 40, 0, 0, 0.1], [0, -1 / 20, 0, 0.5]],
-                    "scenes": [{"scene": 0, "at": [0.5, 0.5], "outlines": []}],
+                    "scenes": [{"scene": k, "at": [0.5 + 0.3 * k, 0.9], "outlines": []} for k in range(2)],
                 }
             )
         if folder == "changes" or rest.endswith(".jpg"):

@@ -144,7 +144,12 @@ export function takeAims(): (() => void)[] {
   return aims.splice(0);
 }
 
-export const tab = (name: Tab) => page.set({ tab: name, folded: false });
+/** Opens a tab. What was chosen on another one closes with it, unless a scene is being moved by hand. */
+export function tab(name: Tab): void {
+  const { tab: before, drag, selection } = page.state;
+  page.set({ tab: name, folded: false, selection: name === before || drag ? selection : null });
+}
+
 export const fold = (folded = !page.state.folded) => page.set({ folded });
 export const help = (shown = !page.state.help) => page.set({ help: shown });
 
@@ -420,10 +425,10 @@ export function choosePair(place: 0 | 1, id: string): void {
 const OF_TAB = { look: "scene", review: "edge", time: "change", things: "object" } as const;
 
 /** The next or previous of the list that the selection is in; without a selection, of the list that is open. */
-export function step(by: 1 | -1): void {
+export function neighbour(by: 1 | -1): Selection | "end" | null {
   const { state } = page;
   const { map } = state;
-  if (!map) return;
+  if (!map) return null;
   const kind = state.selection?.kind ?? OF_TAB[state.tab];
   const listed: Record<Selection["kind"], () => string[]> = {
     scene: () => derive.listedScenes(state).map((one) => one.id),
@@ -433,12 +438,17 @@ export function step(by: 1 | -1): void {
     photo: () => derive.listedPhotos(state).map((one) => one.file),
   };
   const keys = listed[kind]();
-  if (!keys.length) return;
+  if (!keys.length) return null;
   const now = keys.findIndex((key) => derive.isSelected(state, kind, key));
   const next = now < 0 ? (by > 0 ? 0 : keys.length - 1) : now + by;
   const key = keys[next];
-  if (key !== undefined) select({ kind, key });
-  else say(by > 0 ? "That was the last one" : "That was the first one");
+  return key === undefined ? "end" : { kind, key };
+}
+
+export function step(by: 1 | -1): void {
+  const next = neighbour(by);
+  if (next && next !== "end") select(next);
+  else if (next) say(by > 0 ? "That was the last one" : "That was the first one");
 }
 
 export function view(by: 1 | -1, count: number): void {
@@ -576,7 +586,11 @@ export function review(what: Selection, verdict: Verdict, note = ""): Promise<bo
   return send(
     verdict,
     { what: what.key, note: note.trim() },
-    { doing: `${DOING[verdict]} ${before.name}`, done: `${DONE[verdict]}: ${before.name}`, undo },
+    {
+      doing: `${DOING[verdict]} ${before.name}`,
+      done: `${DONE[verdict]}: ${before.name}${what.kind === "edge" ? ". It takes effect with Optimize now" : ""}`,
+      undo,
+    },
   );
 }
 

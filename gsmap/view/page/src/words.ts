@@ -23,6 +23,10 @@ export function metres(value: number): string {
 
 const MONTHS = ["Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec"];
 
+/** One argument of a POSIX shell's command, so that a name from a map is never more than that. */
+export const quote = (text: string) =>
+  /^[\w@%+=:,./][\w@%+=:,./-]*$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`;
+
 /** "3 Mar 2026" of an ISO date; what is no date stays as it is. */
 export function day(at: string | null): string {
   if (!at) return "no date";

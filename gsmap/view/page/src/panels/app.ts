@@ -59,6 +59,9 @@ export class App extends Panel {
         overflow-y: auto;
         overscroll-behavior: contain;
       }
+      .detail > * {
+        flex: none; /* as high as its content: its heading is sticky within it */
+      }
       header {
         display: flex;
         align-items: center;
@@ -359,7 +362,10 @@ export class App extends Panel {
           <p><button class="main" @click=${() => void actions.retry()}>Try again</button></p>
         </div>
       </div>`;
-    if (stageError && actions.planOf(this.state)?.status !== "ready")
+    const plan = actions.planOf(this.state)?.status;
+    if (stageError && plan === "loading")
+      return html`<div class="start"><p class="waiting" role="status">Loading the floor plan</p></div>`;
+    if (stageError && plan !== "ready")
       return html`<div class="start">
         <div class="card stack" role="alert">
           <h2>The 3D view does not work here</h2>

@@ -41,7 +41,7 @@ export class ChangeDetail extends Panel {
         html`<gs-kind .change=${change}></gs-kind> ${actions.titleOfChange(change)}`,
         html`<span class="mark ${STANDS[change.status] ?? ""}">${change.status}</span>
           <span>confidence ${percent(change.confidence)}</span>
-          <span class="anywhere">${pairText(map, change.before, change.after)}</span> <span>${change.id}</span>`,
+          <span class="anywhere">${pairText(map, change.before, change.after)}</span> <span>change ${change.id}</span>`,
         true,
       )}
       <div class="body">

@@ -33,8 +33,9 @@ export class Compare extends LitElement {
         border-radius: 6px;
         overflow: hidden;
         background: #000;
-        min-height: 8rem;
-        align-content: center;
+        aspect-ratio: var(--ratio);
+        max-height: 60vh;
+        grid-template-rows: minmax(0, 1fr);
       }
       .pictures.beside {
         grid-template-columns: 1fr 1fr;
@@ -46,9 +47,18 @@ export class Compare extends LitElement {
       img {
         display: block;
         width: 100%;
-        height: auto;
+        height: 100%;
+        object-fit: contain;
         min-width: 0;
         color: #fff;
+      }
+      .loading {
+        position: absolute;
+        inset: 0;
+        display: grid;
+        place-content: center;
+        color: #fff;
+        pointer-events: none;
       }
       .out {
         visibility: hidden;
@@ -110,6 +120,7 @@ export class Compare extends LitElement {
         background: #000;
       }
       .broken {
+        align-self: center;
         color: #fff;
         padding: 24px;
         text-align: center;
@@ -144,14 +155,12 @@ export class Compare extends LitElement {
         width: fit-content;
         max-width: 100%;
         margin: 0 auto;
-        grid-template-rows: minmax(0, 1fr);
-        align-content: stretch;
+        aspect-ratio: auto;
+        max-height: none;
       }
       dialog img {
         width: auto;
         max-width: 100%;
-        height: 100%;
-        object-fit: contain;
       }
     `,
   ];
@@ -168,8 +177,11 @@ export class Compare extends LitElement {
   @state() private at = 50;
   @state() private broken = false;
   @state() private isLarge = false;
+  @state() private ratio = Compare.lastRatio; // width over height of the pictures
+  @state() private loaded: ReadonlySet<string> = new Set(); // their addresses
   private timer = 0;
   private tries = 0;
+  private static lastRatio = 4 / 3; // expected of pictures that are still loading
 
   override connectedCallback(): void {
     super.connectedCallback();
@@ -230,7 +242,7 @@ export class Compare extends LitElement {
   private pictures() {
     const [first, second, difference] = [this.first, this.second, this.difference].map(relative);
     if (this.broken || !first || !second)
-      return html`<div class="pictures">
+      return html`<div class="pictures" ${this.space()}>
         <div class="broken" role="alert">
           These pictures could not be loaded.<br />
           <button @click=${this.again}>Load them again</button>
@@ -248,15 +260,20 @@ export class Compare extends LitElement {
         >
           ${icon("enlarge")}
         </button>`;
+    const isDifference = this.mode === "difference" && difference;
+    const isLoading = !(isDifference ? [difference] : [first, second]).every((uri) => this.loaded.has(uri));
+    const loading = isLoading ? html`<span class="loading" role="status">Loading the pictures</span>` : nothing;
     if (this.mode === "beside")
-      return html`<div class="pictures beside">
-        ${a()}${b()}${label("left", this.firstName)}${label("right", this.secondName)}${enlarge}
+      return html`<div class="pictures beside" ${this.space()}>
+        ${a()}${b()}${loading}${label("left", this.firstName)}${label("right", this.secondName)}${enlarge}
       </div>`;
-    if (this.mode === "difference" && difference)
-      return html`<div class="pictures">${this.picture(difference, "Difference of both")()}${enlarge}</div>`;
+    if (isDifference)
+      return html`<div class="pictures" ${this.space()}>
+        ${this.picture(difference, "Difference of both")()}${loading}${enlarge}
+      </div>`;
     if (this.mode === "swipe")
-      return html`<div class="pictures stacked" ${vars({ "--at": `${this.at}%` })}>
-        ${a()}${b("swiped")}<span class="swipe-line"></span>
+      return html`<div class="pictures stacked" ${this.space()}>
+        ${a()}${b("swiped")}${loading}<span class="swipe-line"></span>
         <input
           class="swipe-range"
           type="range"
@@ -268,8 +285,8 @@ export class Compare extends LitElement {
         />
         ${label("left", this.firstName)}${label("right", this.secondName)}${enlarge}
       </div>`;
-    return html`<div class="pictures stacked">
-      ${a(this.isSecond ? "out" : "")}${b(this.isSecond ? "" : "out")}
+    return html`<div class="pictures stacked" ${this.space()}>
+      ${a(this.isSecond ? "out" : "")}${b(this.isSecond ? "" : "out")}${loading}
       ${label("left", this.isSecond ? this.secondName : this.firstName)}${enlarge}
     </div>`;
   }
@@ -282,8 +299,19 @@ export class Compare extends LitElement {
         src=${this.tries ? `${uri}?again=${this.tries}` : uri}
         alt=${name}
         decoding="async"
+        @load=${(event: Event) => this.arrived(uri, event.target as HTMLImageElement)}
         @error=${() => (this.broken = true)}
       />`;
+
+  /** The same space before the pictures come and in every mode, so that the buttons below stay where they are. */
+  private space() {
+    return vars({ "--ratio": this.ratio.toFixed(4), "--at": `${this.at}%` });
+  }
+
+  private arrived(uri: string, { naturalWidth: width, naturalHeight: height }: HTMLImageElement): void {
+    this.loaded = new Set([...this.loaded, uri]);
+    if (width && height) this.ratio = Compare.lastRatio = width / height;
+  }
 
   private again(): void {
     this.tries++;

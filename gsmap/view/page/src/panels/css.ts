@@ -181,6 +181,7 @@ export const shared = css`
     gap: 8px;
   }
   .anywhere {
+    min-width: 0;
     overflow-wrap: anywhere;
   }
   .figures {

@@ -137,7 +137,12 @@ export class Edge extends Panel {
           (detail) => this.known(detail, edge, map),
         )}
       </div>
-      <gs-verdict .of=${state.selection} .said=${edge.review} .note=${edge.note}></gs-verdict>
+      <gs-verdict
+        .of=${state.selection}
+        .said=${edge.review}
+        .note=${edge.note}
+        .unconfirmable=${edge.status === "no_match" ? "Nothing to confirm: no pose of this pair was found." : ""}
+      ></gs-verdict>
     `;
   }
 

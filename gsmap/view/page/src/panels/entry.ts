@@ -5,6 +5,7 @@ import * as actions from "../actions";
 import type { FloorPlan } from "../contract";
 import * as derive from "../derive";
 import { page } from "../state";
+import { day } from "../words";
 import { CanvasPanel } from "./base";
 import { shared } from "./css";
 import { icon } from "./icons";
@@ -33,7 +34,7 @@ export class Entry extends CanvasPanel {
         padding: 16px 60px 16px 16px;
         min-height: 0;
         display: grid;
-        grid-template-rows: minmax(0, 1fr) auto;
+        grid-template-rows: auto minmax(0, 1fr) auto;
         gap: 10px;
         background: var(--ground);
         pointer-events: auto;
@@ -83,14 +84,16 @@ export class Entry extends CanvasPanel {
 
   private plan(plan: FloorPlan, error: string | null) {
     const [width, height] = plan.size_m;
+    const { until } = this.state;
     return html`<figure>
+      <h2>Floor plan <span class="muted small">${width.toFixed(0)} × ${height.toFixed(0)} m</span></h2>
       <gs-plan .plan=${plan}></gs-plan>
-      <figcaption role="status">
-        Floor plan, ${width.toFixed(0)} × ${height.toFixed(0)} m.
+      <figcaption role="status" class="small">
+        ${until ? `Outlines of captures until ${day(until)}; the picture shows every capture.` : nothing}
         ${
           error
             ? html`The 3D view needs WebGL 2, which does not work here: look whether the browser's hardware acceleration
-                is on. Lists, reviews and pictures work without it. <span class="small">(${error})</span>`
+              is on. Lists, reviews and pictures work without it. (${error})`
             : "The 3D view is being prepared."
         }
         ${this.isDrawn ? html`<button @click=${actions.stay}>Show what is there of it</button>` : nothing}

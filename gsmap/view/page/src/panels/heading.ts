@@ -5,13 +5,17 @@ import * as actions from "../actions";
 import { icon } from "./icons";
 
 export function heading(name: TemplateResult | string, facts: TemplateResult | string, hasNext = false) {
-  const next = hasNext
-    ? html`<button class="plain square" aria-label="Previous" title="Previous (k)" @click=${() => actions.step(-1)}>
-          ${icon("up")}</button
-        ><button class="plain square" aria-label="Next" title="Next (j)" @click=${() => actions.step(1)}>
-          ${icon("down")}
-        </button>`
-    : nothing;
+  const way = (by: 1 | -1, name: string, key: string) =>
+    html`<button
+      class="plain square"
+      aria-label=${name}
+      title="${name} (${key})"
+      ?disabled=${actions.neighbour(by) === "end"}
+      @click=${() => actions.step(by)}
+    >
+      ${icon(by > 0 ? "down" : "up")}
+    </button>`;
+  const next = hasNext ? html`${way(-1, "Previous", "k")}${way(1, "Next", "j")}` : nothing;
   return html`<div class="heading">
     <h2 class="grow">${name}</h2>
     <span class="ways"

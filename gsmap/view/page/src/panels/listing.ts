@@ -170,7 +170,10 @@ export class Listing extends LitElement {
   protected override willUpdate(changed: PropertyValues): void {
     if (changed.has("chosen") || changed.has("items")) {
       const at = this.indexOf(this.chosen);
-      if (at >= 0 && changed.has("chosen")) this.active = at;
+      if (at >= 0 && changed.has("chosen")) {
+        this.active = at;
+        this.wantsFocus ||= Boolean(this.shadowRoot?.activeElement); // the focus does not stay at the row before
+      }
       this.active = Math.max(0, Math.min(this.active, this.items.length - 1));
     }
   }

@@ -4,7 +4,7 @@ import { customElement } from "lit/decorators.js";
 import * as actions from "../actions";
 import type { MapSummary } from "../contract";
 import * as derive from "../derive";
-import { day, plural } from "../words";
+import { day, plural, quote } from "../words";
 import { Panel } from "./base";
 import { shared } from "./css";
 import { icon } from "./icons";
@@ -73,11 +73,13 @@ export class Pair extends Panel {
   private edge(map: MapSummary, { edge, older, newer }: derive.PairFacts) {
     if (!edge)
       return html`<li>
-        <p>Not registered: <kbd>gsmap register ${map.title} --pairs ${older.name}:${newer.name}</kbd></p>
+        <p>
+          Not registered: <kbd>gsmap register ${quote(map.title)} --pairs ${quote(`${older.name}:${newer.name}`)}</kbd>
+        </p>
       </li>`;
     return html`<li>
       <button class="plain" @click=${() => actions.select({ kind: "edge", key: derive.edgeKey(map, edge) })}>
-        Edge ${markOf(edge)}
+        ${edge.status === "no_match" ? "Connection: none found" : html`Edge ${markOf(edge)}`}
       </button>
     </li>`;
   }
@@ -105,17 +107,20 @@ export class Pair extends Panel {
     const undated = [older, newer].find((scene) => !scene.captured_at);
     if (undated)
       return html`<li>
-        <p>Not compared: ${undated.name} has no date, which <kbd>gsmap edit</kbd> or Time sets</p>
+        <p>Changes: not compared, as ${undated.name} has no date, which <kbd>gsmap edit</kbd> or Time sets</p>
       </li>`;
     if (older.component !== newer.component)
-      return html`<li><p>Not comparable: they are in different components</p></li>`;
+      return html`<li><p>Changes: not comparable, as the two are in different components</p></li>`;
     return html`<li>
       ${
         isUncompared && actions.mayAct(this.state)
           ? html`<button class="plain" ?disabled=${this.state.busy !== null} @click=${() => void actions.compare()}>
-              ${icon("clock")} Not compared: compare now
+              ${icon("clock")} Changes: not compared; compare now
             </button>`
-          : html`<p>Not compared: <kbd>gsmap changes ${map.title} ${older.name}:${newer.name}</kbd></p>`
+          : html`<p>
+              Changes: not compared.
+              <kbd>gsmap changes ${quote(map.title)} ${quote(`${older.name}:${newer.name}`)}</kbd>
+            </p>`
       }
     </li>`;
   }

@@ -2,10 +2,10 @@
 import { css, html, nothing, svg } from "lit";
 import { customElement, property } from "lit/decorators.js";
 import * as actions from "../actions";
-import type { Box, ChangeEntry, FloorPlan, GraphEntry, Vector } from "../contract";
+import type { Box, ChangeEntry, FloorPlan, GraphEntry, ObjectEntry, SceneEntry, Vector } from "../contract";
 import * as derive from "../derive";
 import { page } from "../state";
-import { middleOf } from "../words";
+import { middleOf, titleOf } from "../words";
 import { Panel, vars } from "./base";
 import { shared } from "./css";
 import "./kind";
@@ -51,7 +51,19 @@ export class Plan extends Panel {
         stroke: var(--muted);
         stroke-width: 1;
       }
+      .object {
+        stroke: var(--text);
+        stroke-width: 1;
+        opacity: 0.35;
+        pointer-events: all;
+        cursor: pointer;
+      }
+      .object:hover {
+        stroke-width: 2.5;
+        opacity: 1;
+      }
       .thing {
+        pointer-events: none;
         stroke: var(--bad);
         stroke-width: 2.5;
         opacity: 1;
@@ -74,12 +86,20 @@ export class Plan extends Panel {
         color: var(--muted);
         font-size: 0.78rem;
       }
-      button.spot {
+      button.at {
         min-height: 0;
-        padding: 6px;
+        padding: 2px 4px;
         border: 0;
         background: none;
         pointer-events: auto;
+      }
+      button.scene[aria-pressed="true"],
+      button.scene:hover {
+        color: var(--accent-text);
+        text-decoration: underline;
+      }
+      button.spot {
+        padding: 6px;
         text-shadow: none;
       }
       button.spot gs-kind {
@@ -87,7 +107,7 @@ export class Plan extends Panel {
         border-radius: 99px;
       }
       @media (max-width: 759px) {
-        button.spot {
+        button.at {
           min-width: 36px;
           min-height: 36px;
         }
@@ -109,7 +129,8 @@ export class Plan extends Panel {
     const { plan, state } = this;
     const { map, component, selection } = state;
     if (!plan || !map) return nothing;
-    const { picture, size_m: size, scenes } = plan;
+    const { picture, size_m: size } = plan;
+    const scenes = plan.scenes.filter(({ scene }) => derive.isBy(map.scenes[scene]?.captured_at ?? null, state.until));
     const high = (WIDTH * size[1]) / size[0];
     const uri = picture?.startsWith("data:image/webp;base64,") ? picture : null;
     const changes = derive.shownChanges(state);
@@ -118,6 +139,12 @@ export class Plan extends Panel {
     const graph = known?.status === "ready" ? known.value : null;
     const rooms = graph?.rooms.filter((room) => room.component === component) ?? [];
     const bold = (id: string) => state.hovered === id || selection?.key === id;
+    const isListed = !this.small && (state.tab === "things" || selection?.kind === "object");
+    const objects = isListed
+      ? this.objects(graph)
+          .filter((one) => one.present)
+          .sort(bySize)
+      : [];
     const boxes = [...changes, ...this.objects(graph)].filter(({ id }) => bold(id)).map(({ box }) => box);
     const point = ([x, y]: Place) => `${(WIDTH * x).toFixed(1)} ${(high * y).toFixed(1)}`;
     const line = (ends: Place[]) => `M${ends.map(point).join("L")}`;
@@ -133,6 +160,13 @@ export class Plan extends Panel {
         ${rooms.map(
           ({ outline }) => svg`<path class="room-outline" d=${outline.map((ends) => line(ends.map(on))).join("")} />`,
         )}
+        ${objects.map(
+          (one) =>
+            svg`<path class="object" data-id=${one.id} d="${line(footprint(one.box, on))}Z"
+              @click=${() => actions.select({ kind: "object", key: one.id })}
+              @pointerenter=${() => actions.hover(one.id)}
+              @pointerleave=${() => actions.hover(null)}><title>${titleOf(one)}</title></path>`,
+        )}
         ${boxes.map(
           (box) =>
             svg`<path class="thing" d=${edgesOf(box)
@@ -140,11 +174,7 @@ export class Plan extends Panel {
               .join("")} />`,
         )}
       </svg>
-      ${
-        this.small
-          ? nothing
-          : scenes.map(({ scene, at }) => html`<span class="at" ${place(at)}>${map.scenes[scene]?.name ?? ""}</span>`)
-      }
+      ${this.small ? nothing : scenes.map(({ scene, at }) => this.scene(map.scenes[scene], at))}
       ${rooms.map(({ id, outline }) => html`<span class="at room" ${place(on(middleOf(actions.around(outline.flat()))))}>${id}</span>`)}
       ${changes.map((one) => this.change(one, on(middleOf(one.box)), bold(one.id)))}
     </div>`;
@@ -152,6 +182,18 @@ export class Plan extends Panel {
 
   private objects(graph: GraphEntry | null) {
     return graph?.objects.filter((one) => one.component === this.state.component) ?? [];
+  }
+
+  private scene(one: SceneEntry | undefined, at: Place) {
+    if (!one) return nothing;
+    return html`<button
+      class="at scene"
+      aria-pressed=${derive.isSelected(this.state, "scene", one.id)}
+      ${place(at)}
+      @click=${() => actions.select({ kind: "scene", key: one.id }, false)}
+    >
+      ${one.name}
+    </button>`;
   }
 
   private change(one: ChangeEntry, at: Place, isBold: boolean) {
@@ -183,9 +225,29 @@ export function whereItIs() {
 
 const place = ([x, y]: Place) => vars({ "--x": `${(100 * x).toFixed(2)}%`, "--y": `${(100 * y).toFixed(2)}%` });
 
+const volume = ([low, high]: Box) => low.reduce((product, v, i) => product * ((high[i] ?? v) - v), 1);
+
+/** Large objects first, so that the small ones in them are on top. */
+const bySize = (a: ObjectEntry, b: ObjectEntry) => volume(b.box) - volume(a.box);
+
+/** Corner of a box by its number: bit i is set at the highest coordinate i. */
+const cornerOf = (box: Box) => (i: number) => [0, 1, 2].map((axis) => box[(i >> axis) & 1]?.[axis] ?? 0) as Vector;
+
+/** The face of a box that is the largest on the plan, in order around it. */
+function footprint(box: Box, on: (at: Vector) => Place): Place[] {
+  const faces = [
+    [0, 1, 3, 2],
+    [0, 1, 5, 4],
+    [0, 2, 6, 4],
+  ].map((face) => face.map(cornerOf(box)).map(on));
+  const area = ([a, b, , d]: Place[]) =>
+    a && b && d ? Math.abs((b[0] - a[0]) * (d[1] - a[1]) - (b[1] - a[1]) * (d[0] - a[0])) : 0;
+  return faces.reduce((best, face) => (area(face) > area(best) ? face : best));
+}
+
 /** The twelve edges of a box. */
 function edgesOf(box: Box): [Vector, Vector][] {
-  const corner = (i: number) => [0, 1, 2].map((axis) => box[(i >> axis) & 1]?.[axis] ?? 0) as Vector;
+  const corner = cornerOf(box);
   return [0, 1, 2, 3, 4, 5, 6, 7].flatMap((i) =>
     [1, 2, 4].filter((bit) => !(i & bit)).map((bit): [Vector, Vector] => [corner(i), corner(i | bit)]),
   );

@@ -17,7 +17,7 @@ const NAMES: Record<EdgeFilter, string> = {
   "one pair": "One pair",
   tentative: "Tentative",
   undecided: "Undecided",
-  rejected: "Rejected",
+  rejected: "Rejected or not found",
   reviewed: "Reviewed",
   all: "All",
 };

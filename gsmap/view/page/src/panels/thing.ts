@@ -23,6 +23,8 @@ export class Thing extends Panel {
       .picture {
         display: block;
         width: 100%;
+        aspect-ratio: 4 / 3; /* of every picture of an object, so that nothing moves when it comes */
+        object-fit: contain;
         border-radius: 6px;
         background: #000;
       }

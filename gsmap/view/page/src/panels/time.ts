@@ -6,7 +6,7 @@ import type { ChangeEntry, MapSummary, SceneEntry } from "../contract";
 import * as derive from "../derive";
 import { CHANGE_FILTERS, page } from "../state";
 import type { ChangeFilter } from "../state";
-import { day, moment, pairText, percent, plural } from "../words";
+import { day, moment, pairText, percent, plural, quote } from "../words";
 import { Panel } from "./base";
 import { shared } from "./css";
 import { icon } from "./icons";
@@ -227,7 +227,7 @@ export class Time extends Panel {
                 Compare them now
               </button>
             </p>`
-          : html`<p><kbd>gsmap changes ${map.title}</kbd></p>`
+          : html`<p><kbd>gsmap changes ${quote(map.title)}</kbd></p>`
       }
     </div>`;
   }
@@ -256,7 +256,7 @@ export class Time extends Panel {
                     @change=${(event: Event) => this.setDate(scene, event.target as HTMLInputElement)}
                 /></label>`,
             )
-          : html`<p><kbd>gsmap edit ${map.title} ${first.name} --captured-at 2026-03-31</kbd></p>`
+          : html`<p><kbd>gsmap edit ${quote(map.title)} ${quote(first.name)} --captured-at 2026-03-31</kbd></p>`
       }
       ${scenes.length > shown.length ? html`<p class="muted small">and ${scenes.length - shown.length} more</p>` : nothing}
     </div>`;

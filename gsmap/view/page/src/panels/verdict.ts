@@ -35,7 +35,8 @@ export class VerdictForm extends Panel {
       }
       .buttons {
         display: grid;
-        grid-template-columns: 1fr 1fr auto;
+        grid-auto-flow: column;
+        grid-auto-columns: 1fr;
         gap: 8px;
         margin-top: 8px;
       }
@@ -77,6 +78,7 @@ export class VerdictForm extends Panel {
 
   @property({ attribute: false }) of: Selection | null = null;
   @property() said: "confirm" | "reject" | null = null;
+  @property() unconfirmable = ""; // why it cannot be confirmed; empty where it can
   @property() note = ""; // of the standing review
 
   // What was typed is kept by what it is about, so that nothing is lost by looking elsewhere meanwhile.
@@ -102,21 +104,27 @@ export class VerdictForm extends Panel {
       >
         ${icon(sign)} <span>${label}</span>
       </button>`;
-    return html`<form @submit=${(event: Event) => event.preventDefault()}>
-      <textarea
-        id="note"
-        rows="1"
-        maxlength="500"
-        aria-label="Note to the review"
-        placeholder=${this.note ? `Note so far: ${this.note}` : "Note: why (optional)"}
-        .value=${VerdictForm.typed.get(this.of.key) ?? ""}
-        @input=${this.type}
-      ></textarea>
-      <div class="buttons">
-        ${button("confirm", "Confirm", "check", "c")} ${button("reject", "Reject", "cross", "r")}
-        ${button("withdraw", "Withdraw", "undo", "t")}
-      </div>
-    </form>`;
+    return html`${this.unconfirmable ? html`<p class="muted small">${this.unconfirmable}</p>` : nothing}
+      ${
+        this.of.kind === "edge" && this.said && state.map?.stale
+          ? html`<p class="muted small">The review takes effect with Optimize now.</p>`
+          : nothing
+      }
+      <form @submit=${(event: Event) => event.preventDefault()}>
+        <textarea
+          id="note"
+          rows="1"
+          maxlength="500"
+          aria-label="Note to the review"
+          placeholder=${this.note ? `Note so far: ${this.note}` : "Note: why (optional)"}
+          .value=${VerdictForm.typed.get(this.of.key) ?? ""}
+          @input=${this.type}
+        ></textarea>
+        <div class="buttons">
+          ${this.unconfirmable ? nothing : button("confirm", "Confirm", "check", "c")}
+          ${button("reject", "Reject", "cross", "r")} ${button("withdraw", "Withdraw", "undo", "t")}
+        </div>
+      </form>`;
   }
 
   focusNote(): void {
@@ -130,6 +138,10 @@ export class VerdictForm extends Panel {
   async send(verdict: Verdict): Promise<void> {
     const { of } = this;
     if (!of) return;
+    if (verdict === "confirm" && this.unconfirmable) {
+      actions.say(this.unconfirmable);
+      return;
+    }
     if (await actions.review(of, verdict, VerdictForm.typed.get(of.key) ?? "")) {
       VerdictForm.typed.delete(of.key);
       this.requestUpdate();
