@@ -281,7 +281,7 @@ def test_confirm_reject_withdraw_with_notes_and_undo_of_each(hands, server):
 def test_buttons_and_heading_of_the_details_stay_where_they_are(hands):
     review(hands)
     hands.wait("findAll('img').every((e) => e.complete && e.naturalWidth)")
-    place = "find('button', 'Side by side').getBoundingClientRect().y"
+    place = "['Side by side', 'Next camera'].map((name) => find('button', name).getBoundingClientRect().y)"
     at = hands.value(place)
     hands.click("button", "Side by side")
     hands.wait("findAll('.pictures.beside img').length === 2")
@@ -565,6 +565,14 @@ def test_without_a_3d_view_nothing_is_offered_that_needs_one(hands, server):
     hands.says("Uncertainty of its middle", "gs-scene")
     hands.press("Escape", "End", "4")
     hands.wait("findAll('path.object').length === 3")  # of four, one is gone
+    x, y = hands.middle("path.object[data-id=o2]")
+    wide = hands.value("find('.sheet', null).clientWidth")
+    hands._mouse("mouseWheel", x, y, deltaX=0, deltaY=-400)
+    hands.wait(f"find('.sheet', null).clientWidth > 2 * {wide}")
+    assert hands.middle("path.object[data-id=o2]") == pytest.approx((x, y), abs=2), "it grows about the pointer"
+    hands.drag(x, y, x + 40, y + 30)
+    assert hands.middle("path.object[data-id=o2]") == pytest.approx((x + 40, y + 30), abs=2)
+    assert hands.value("findAll('aside.detail').length") == 0, "a drag chooses nothing"
     hands.click("path.object[data-id=o2]")
     hands.says("red cabinet", "gs-thing")
 

@@ -224,17 +224,13 @@ export class Compare extends LitElement {
             </button>`,
         )}
       </div>
-      ${
-        this.mode === "blink"
-          ? html`<button
-              class="square"
-              aria-label=${this.paused ? "Go on blinking" : "Stop blinking"}
-              @click=${() => (this.paused = !this.paused)}
-            >
-              ${icon(this.paused ? "play" : "pause")}
-            </button>`
-          : nothing
-      }
+      <button
+        class="square ${this.mode === "blink" ? "" : "out"}"
+        aria-label=${this.paused ? "Go on blinking" : "Stop blinking"}
+        @click=${() => (this.paused = !this.paused)}
+      >
+        ${icon(this.paused ? "play" : "pause")}
+      </button>
       ${this.isLarge ? html`<button @click=${() => this.renderRoot.querySelector("dialog")?.close()}>Close</button>` : nothing}
     </div>`;
   }

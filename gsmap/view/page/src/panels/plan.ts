@@ -1,6 +1,6 @@
 // A floor plan with its rooms, the numbered changes of the list, and the object that is chosen or pointed at.
 import { css, html, nothing, svg } from "lit";
-import { customElement, property } from "lit/decorators.js";
+import { customElement, property, state } from "lit/decorators.js";
 import * as actions from "../actions";
 import type { Box, ChangeEntry, FloorPlan, GraphEntry, ObjectEntry, SceneEntry, Vector } from "../contract";
 import * as derive from "../derive";
@@ -11,6 +11,9 @@ import { shared } from "./css";
 import "./kind";
 
 const WIDTH = 1000; // of the drawing's own units
+const MOST_ZOOM = 12;
+const WHEEL_PX = 400; // of scrolling, by which the plan grows e-fold
+const DRAG_PX = 4; // shorter ones are clicks
 type Place = [number, number];
 
 @customElement("gs-plan")
@@ -25,6 +28,10 @@ export class Plan extends Panel {
         container-type: size;
         display: grid;
         place-content: center;
+        touch-action: none;
+      }
+      :host([zoomed]) {
+        overflow: hidden;
       }
       .sheet {
         position: relative;
@@ -32,7 +39,8 @@ export class Plan extends Panel {
         width: 100%;
       }
       :host(:not([small])) .sheet {
-        width: min(100cqw, 100cqh * var(--ratio));
+        width: calc(min(100cqw, 100cqh * var(--ratio)) * var(--zoom));
+        transform: translate(var(--right), var(--down));
       }
       svg {
         position: absolute;
@@ -125,6 +133,50 @@ export class Plan extends Panel {
   @property({ attribute: false }) plan: FloorPlan | null = null;
   @property({ type: Boolean, reflect: true }) small = false;
 
+  @state() private zoom = 1;
+  @state() private at: Place = [0, 0]; // of the sheet's middle from the element's, pixels
+  private held: Place | null = null; // where the pointer was, of a drag
+
+  constructor() {
+    super();
+    this.addEventListener("wheel", this.wheeled);
+    this.addEventListener("pointerdown", ({ button, clientX, clientY }) => {
+      this.held = button === 0 && this.zoom > 1 ? [clientX, clientY] : null;
+    });
+    this.addEventListener("pointermove", this.dragged);
+    for (const name of ["pointerup", "pointercancel"]) this.addEventListener(name, () => (this.held = null));
+  }
+
+  /** Zooms about the pointer. */
+  private readonly wheeled = (event: WheelEvent): void => {
+    if (this.small) return;
+    event.preventDefault();
+    const zoom = Math.max(1, Math.min(MOST_ZOOM, this.zoom * Math.exp(-event.deltaY / WHEEL_PX)));
+    const { left, top, width, height } = this.getBoundingClientRect();
+    const pointer: Place = [event.clientX - left - width / 2, event.clientY - top - height / 2];
+    const by = zoom / this.zoom;
+    this.zoom = zoom;
+    this.moveTo(this.at.map((v, i) => (pointer[i] ?? 0) * (1 - by) + v * by) as Place);
+  };
+
+  private readonly dragged = (event: PointerEvent): void => {
+    if (!this.held || !(event.buttons & 1)) return;
+    const by = [event.clientX - this.held[0], event.clientY - this.held[1]] as const;
+    if (!this.hasPointerCapture(event.pointerId)) {
+      if (Math.hypot(...by) < DRAG_PX) return; // still a click
+      this.setPointerCapture(event.pointerId);
+    }
+    this.held = [event.clientX, event.clientY];
+    this.moveTo([this.at[0] + by[0], this.at[1] + by[1]]);
+  };
+
+  /** Keeps the middle of the view on the sheet. */
+  private moveTo(at: Place): void {
+    this.toggleAttribute("zoomed", this.zoom > 1);
+    const most = [this.clientWidth, this.clientHeight].map((side) => ((this.zoom - 1) * side) / 2);
+    this.at = at.map((v, i) => Math.max(-(most[i] ?? 0), Math.min(most[i] ?? 0, v))) as Place;
+  }
+
   protected override render() {
     const { plan, state } = this;
     const { map, component, selection } = state;
@@ -149,7 +201,15 @@ export class Plan extends Panel {
     const point = ([x, y]: Place) => `${(WIDTH * x).toFixed(1)} ${(high * y).toFixed(1)}`;
     const line = (ends: Place[]) => `M${ends.map(point).join("L")}`;
     const on = (at: Vector) => derive.onPlan(plan, at);
-    return html`<div class="sheet" ${vars({ "--ratio": (size[0] / size[1]).toFixed(4) })}>
+    return html`<div
+      class="sheet"
+      ${vars({
+        "--ratio": (size[0] / size[1]).toFixed(4),
+        "--zoom": String(this.zoom),
+        "--right": `${this.at[0]}px`,
+        "--down": `${this.at[1]}px`,
+      })}
+    >
       <svg viewBox="0 0 ${WIDTH} ${high}" role="img" aria-label="Floor plan of the map">
         ${uri ? svg`<image href=${uri} width=${WIDTH} height=${high} preserveAspectRatio="none" />` : nothing}
         ${
