@@ -8,14 +8,17 @@ import signal
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from raising import raises
 
 from gsmap import engine
 from gsmap.engine import QuarantinedJob, pool
+from gsmap.engine.blas_threads import _controls
 from gsmap.engine.executors.local import Params, start
 from gsmap.errors import ConfigError, GsmapError
 
@@ -97,6 +100,32 @@ def test_same_results_for_one_and_many_workers() -> None:
     assert {i: v for i, (v, _) in inline.items()} == {i: v for i, (v, _) in spread.items()}
     assert {pid for _, pid in inline.values()} == {os.getpid()}
     assert os.getpid() not in {pid for _, pid in spread.values()}
+
+
+def spectrum(seed: int) -> bytes:
+    square_root = np.random.default_rng(seed).normal(size=(150, 150))
+    return bytes(np.linalg.eigh(square_root @ square_root.T)[0].tobytes())
+
+
+def test_the_threads_of_blas_change_no_bit() -> None:
+    found = []
+    for count in (1, 2):
+        with with_blas_threads(count):
+            found += [dict(run_jobs(spectrum, [(i,) for i in range(8)], Params(workers=k))) for k in (1, 2)]
+            assert {get() for get, _ in _controls()} == {count}  # as before
+    assert all(one == found[0] for one in found)
+
+
+@contextmanager
+def with_blas_threads(count: int) -> Iterator[None]:
+    """Another number of threads of BLAS than usual."""
+    before = [get() for get, _ in _controls()]
+    assert before, "numpy comes with OpenBLAS"
+    for _, set_count in _controls():
+        set_count(count)
+    yield
+    for was, (_, set_count) in zip(before, _controls(), strict=True):
+        set_count(was)
 
 
 def test_workers_share_the_processors(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -174,7 +174,8 @@ def test_a_map_made_on_a_cluster_is_the_same_to_the_bit(cluster: Any, tmp_path: 
             site.with_settings(values)
             site.update(tmp_path / "captures")
             site.export(tmp_path / executor, format="ply", tile_size_m=4.0, steps=10)
-            edges = [(e.target, e.source, e.status, e.S_target_source) for e in site.edge_rows()]
+            rows = sorted(site.edge_rows(), key=lambda e: (e.target, e.source))  # committed as they were done
+            edges = [(e.target, e.source, e.status, e.S_target_source, e.information) for e in rows]
             poses = {scene: pose.S_map_scene.matrix().tobytes() for scene, pose in site.pose_graph().poses.items()}
             graphs = sorted((one.key, one.scene, one.num_nodes) for one in site.store.graphs.list())
             arrays = sorted(group.name for group in (tmp_path / f"{executor}.gsmap" / "arrays" / "graphs").iterdir())

@@ -11,6 +11,7 @@ from operator import length_hint
 from typing import Any
 
 from gsmap import platform
+from gsmap.engine.blas_threads import one_blas_thread
 from gsmap.engine.pool import Pool
 from gsmap.errors import ConfigError
 
@@ -53,7 +54,8 @@ class LocalWorkers:
             if taken is None:
                 return
             began = time.monotonic()
-            result = job(*taken[1])
+            with one_blas_thread():
+                result = job(*taken[1])
             took_s.append(time.monotonic() - began)
             yield taken[0], result
         first = list(islice(todo, 2))
