@@ -25,11 +25,7 @@ MIN_AGREEMENT = 0.1
 """If a repeated direct alignment agrees less, the photo shows another place (``tools/fit/localize.py``)."""
 
 REPEAT_BELOW_AGREEMENT = 0.5
-"""If a refinement agrees less and has not converged, it is run once more from its own result."""
-
-CONVERGED_SIGMAS = 3.0
-"""A refinement has converged if direct alignment moved the pose from that of the first patches by less, in standard
-deviations. On synthetic places, correct poses gained by a repeat only where it moved by 4.8 or more."""
+"""If a refinement agrees less, it is run once more from its own result."""
 
 MAX_INLIER_PX = 2.0
 """Largest distance between an inlier patch and its prediction, for a photo of 480 pixels."""
@@ -83,8 +79,6 @@ class RefinedPose:
         agreement: correlation of render and photo at the start of the last direct alignment
             (`gsmap.localize.direct_alignment.DirectAlignment`); 0 without one.
         renders: renders from the pose or from nearby; empty if the photo shows another place.
-        moved_sigmas: distance from the pose before direct alignment, in standard deviations (root mean square over the
-            six parameters).
     """
 
     T_metric_camera: np.ndarray
@@ -97,7 +91,6 @@ class RefinedPose:
     num_tracked: int
     agreement: float
     renders: Sequence[SceneRender]
-    moved_sigmas: float = np.inf
 
     def inliers(self, size_px: tuple[int, int]) -> np.ndarray:
         """Return a (K,) mask of patches within `MAX_INLIER_PX` of their prediction."""
@@ -121,7 +114,7 @@ def refine_pose(
     """
     scenes = scenes[:MAX_SCENES]
     found = _refine_once(photo, T_metric_camera, intrinsics_px, scenes)
-    if found.fit is not None and found.agreement < REPEAT_BELOW_AGREEMENT and found.moved_sigmas > CONVERGED_SIGMAS:
+    if found.fit is not None and found.agreement < REPEAT_BELOW_AGREEMENT:
         again = _refine_once(photo, found.T_metric_camera, found.intrinsics_px, scenes, found.renders)
         found = again if again.agreement > found.agreement else found
     if not found.renders:
@@ -160,7 +153,7 @@ def _refine_once(
         renders = render_scenes(scenes, pose, lens / 2, half.size_px, renders, _SAME_PX)
         counts = direct_alignment.measure_agreements(half.rgb, renders, direct_alignment.BLUR_PX[0] / 2, half.mask)
     best = int(np.argmax(counts))
-    aligned, agreement, unaligned = None, 0.0, pose
+    aligned, agreement = None, 0.0
     for blur in direct_alignment.BLUR_PX:
         max_motion = _MAX_MOTION_BLURS * blur / 2
         renders = render_scenes(
@@ -191,7 +184,6 @@ def _refine_once(
     if known is None:
         return _unconstrained(pose, lens, agreement)
     known = covariance.add_model_error(known[:6, :6] * covariance.agreement_scale(agreement) ** 2)
-    moved = resection.relative_xi(pose, unaligned)
     return RefinedPose(
         pose,
         lens,
@@ -203,7 +195,6 @@ def _refine_once(
         patches.num_tracked,
         agreement,
         renders,
-        float(np.sqrt(moved @ np.linalg.solve(known, moved) / len(moved))),
     )
 
 
