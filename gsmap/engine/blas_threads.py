@@ -8,24 +8,36 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import threading
 from collections.abc import Callable, Iterator
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
+_lock = threading.Lock()
+_before: list[int] = []  # numbers of threads before the first of the jobs that run now
+_depth = 0  # number of jobs of this process that run now, in several threads
+
 
 @contextlib.contextmanager
 def one_blas_thread() -> Iterator[None]:
     """Let the OpenBLAS of numpy and scipy use one thread inside; other libraries of BLAS are left as they are."""
+    global _before, _depth
     known = _controls()
-    before = [get() for get, _ in known]
-    for _, set_count in known:
-        set_count(1)
+    with _lock:
+        if not _depth:
+            _before = [get() for get, _ in known]
+            for _, set_count in known:
+                set_count(1)
+        _depth += 1
     try:
         yield
     finally:
-        for count, (_, set_count) in zip(before, known, strict=True):
-            set_count(count)
+        with _lock:
+            _depth -= 1
+            if not _depth:
+                for count, (_, set_count) in zip(_before, known, strict=True):
+                    set_count(count)
 
 
 @cache

@@ -482,7 +482,9 @@ def _hit(
 ) -> FindHit:
     component = index.poses.poses[scene].component
     metres = index.known.metres.get(component, 1.0)
-    seen = [s.scene for s in thing.sightings if s.state == "seen"] if thing is not None else [scene]
+    seen = [scene]
+    if thing is not None:  # photos that see it are no scenes
+        seen = [s.scene for s in thing.sightings if s.state == "seen" and s.scene in index.scenes]
     at = position if thing is None else thing.position
     assert at is not None
     return FindHit(

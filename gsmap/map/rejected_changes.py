@@ -58,8 +58,9 @@ def rejected_places(
         if component in around:
             near = np.flatnonzero(_gaps(_box_in_map(place), around[component]) < margin_m)
             margin_m = min((_gap(place, claimed[component][i]) for i in near), default=margin_m)
+            margin_m = np.floor(100 * margin_m + 1e-3) / 100  # in whole centimetres: poses change by less
         if margin_m >= 0:
-            out.setdefault(scene, []).append(replace(place, margin_m=min(margin_m, place.margin_m)))
+            out.setdefault(scene, []).append(replace(place, margin_m=float(margin_m)))
     return out
 
 

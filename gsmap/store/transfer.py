@@ -87,7 +87,10 @@ def open_transfer(
         into.catalog.hold_until_commit(into.arrays.lock())
         if same_home:
             theirs = stack.enter_context(source.catalog.read())
-        yield Transfer(into, source, ours, theirs, only, None if same_home else staged, damaged)
+        made = Transfer(into, source, ours, theirs, only, None if same_home else staged, damaged)
+        if damaged:
+            made.notes.append(f"{len(damaged)} damaged results are not copied: gsmap computes them again")
+        yield made
 
 
 class Transfer:
@@ -276,7 +279,7 @@ class Transfer:
 
         Graphs are identified by their keys; of a scene that is thinned there only, they are copied where this map has
         none. Of other kinds a scene has one result, which holds for its stored Gaussians: it is copied where this map
-        has none, and only for the same Gaussians. Damaged ones are left out.
+        has none, and only for the same Gaussians. Damaged ones but graphs are left out.
         """
         whose = self.ours.execute(select(results).where(results.c.scene.is_not(None))).all()
         here = {(row.kind, row.key): row.group_id for row in whose}

@@ -18,7 +18,7 @@ from raising import raises
 
 from gsmap import engine
 from gsmap.engine import QuarantinedJob, pool
-from gsmap.engine.blas_threads import _controls
+from gsmap.engine.blas_threads import _controls, one_blas_thread
 from gsmap.engine.executors.local import Params, start
 from gsmap.errors import ConfigError, GsmapError
 
@@ -112,8 +112,20 @@ def test_the_threads_of_blas_change_no_bit() -> None:
     for count in (1, 2):
         with with_blas_threads(count):
             found += [dict(run_jobs(spectrum, [(i,) for i in range(8)], Params(workers=k))) for k in (1, 2)]
+            assert dict(run_jobs(spectrum, [(0,)], Params(workers=2))) == {0: found[0][0]}  # one job alone
             assert {get() for get, _ in _controls()} == {count}  # as before
     assert all(one == found[0] for one in found)
+
+
+def test_jobs_in_threads_of_one_process_leave_the_threads_of_blas_as_they_were() -> None:
+    with with_blas_threads(2):
+        first, second = one_blas_thread(), one_blas_thread()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert {get() for get, _ in _controls()} == {1}  # the second job still runs
+        second.__exit__(None, None, None)
+        assert {get() for get, _ in _controls()} == {2}
 
 
 @contextmanager

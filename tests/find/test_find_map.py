@@ -14,7 +14,9 @@ import gsmap
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.map import Map
 from gsmap.map.comparison_pictures import PictureFolder
+from gsmap.map.objects import load_objects
 from gsmap.map.stages import component_objects
+from gsmap.types.localized_photo import LocalizedPhoto, PhotoObjectObservation
 from gsmap.types.rows.find import FindHit, FindReport
 from tools.make.tiny_encoder import image_encoder
 from tools.make.tiny_text import text_tower, tokenizer
@@ -55,6 +57,22 @@ def test_only_objects_that_the_map_lists_are_found(site: Map, monkeypatch: pytes
     hits = site.find(like=min(listed), top=100).hits
     assert {hit.object for hit in hits} <= listed
     assert len(hits) > 4
+
+
+def test_objects_that_a_kept_photo_saw_are_found(site: Map) -> None:
+    (known,) = site.objects().objects[:1]
+    scene = site.scenes()[0].id
+    placed = site.store.revisions.get()
+    assert placed is not None
+    things = (PhotoObjectObservation(placed.poses[scene].S_map_scene.inverse().apply(known.position), "seen", 0.9),)
+    lens = np.array([500.0, 500, 320, 240])
+    photo = LocalizedPhoto("0" * 64, "a.jpg", "2026-07-01", scene, np.eye(4), np.eye(6), lens, (640, 480), 0.99, things)
+    site.store.photos.add(photo, b"\xff\xd8\xff" + bytes(200))
+    try:
+        assert "0" * 64 in {one.scene for one in load_objects(site.store, site.settings).objects[0].sightings}
+        assert site.find(like=known.id).hits[0].dates == tuple(f"{date}T00:00:00+00:00" for date in DATES.values())
+    finally:
+        site.store.photos.remove(site.store.photos.list()[0].number)
 
 
 def test_an_object_and_a_node_find_the_same(site: Map) -> None:

@@ -154,7 +154,8 @@ class DaskWorkers:
         if getattr(error, "code", None) != "map_not_found":
             return error
         explained = NotFoundError(
-            f"a worker of {self._address} cannot see the map: mount it there under the same path",
+            f"a worker of {self._address} cannot see the map: mount it there under the same path, or set the same "
+            f"variables (AWS_...) for an object store ({error})",
             code="map_not_on_worker",
         )
         explained.__cause__ = error

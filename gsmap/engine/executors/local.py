@@ -61,7 +61,9 @@ class LocalWorkers:
         first = list(islice(todo, 2))
         if len(first) == 1 and not self._pool.num_idle:
             index, args = first[0]
-            yield index, job(*args)
+            with one_blas_thread():
+                result = job(*args)
+            yield index, result
             return
         yield from self._pool.run(job, chain(first, todo))
 
