@@ -41,8 +41,8 @@ def test_create_refuses_what_is_there(tmp_path):
 def test_a_map_made_by_another_process_meanwhile_is_opened(tmp_path, monkeypatch):
     make_catalog, made = store_module._make_catalog, []
 
-    def another_first(staged, url):
-        make_catalog(staged, url)
+    def another_first(staged, url, undo):
+        make_catalog(staged, url, undo)
         if not made:
             made.append(True)
             Store.create(tmp_path / f"{len(list(tmp_path.glob('?.gsmap')))}.gsmap").close()
