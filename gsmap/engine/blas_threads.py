@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 _lock = threading.Lock()
 _before: list[int] = []  # numbers of threads before the first of the jobs that run now
@@ -40,14 +41,21 @@ def one_blas_thread() -> Iterator[None]:
                     set_count(count)
 
 
+def run_with_one_blas_thread(job: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    """Run a job inside `one_blas_thread` and return its result."""
+    with one_blas_thread():
+        return job(*arguments)
+
+
 @cache
 def _controls() -> tuple[tuple[Callable[[], int], Callable[[int], None]], ...]:
     """Return functions that get and set the number of threads of each OpenBLAS that comes with numpy and scipy."""
     found = []
     for package in ("numpy", "scipy"):
         spec = find_spec(package)
-        folder = Path(spec.origin).parents[1] / f"{package}.libs" if spec is not None and spec.origin else Path()
-        for path in sorted(folder.glob("*openblas*")):
+        if spec is None or spec.origin is None:
+            continue
+        for path in sorted((Path(spec.origin).parents[1] / f"{package}.libs").glob("*openblas*")):
             library = ctypes.CDLL(str(path))  # the one that the package has loaded
             for suffix in ("64_", ""):
                 with contextlib.suppress(AttributeError):

@@ -88,13 +88,11 @@ def answer(message: bytes) -> bytes:
     import pickle
     import traceback
 
-    from gsmap.engine.blas_threads import one_blas_thread
+    from gsmap.engine.blas_threads import run_with_one_blas_thread
 
     try:
         job, arguments = pickle.loads(message)
-        with one_blas_thread():
-            result = job(*arguments)
-        return pickle.dumps((True, result), pickle.HIGHEST_PROTOCOL)
+        return pickle.dumps((True, run_with_one_blas_thread(job, arguments)), pickle.HIGHEST_PROTOCOL)
     except BaseException as error:
         trace = "".join(traceback.format_exception(error))
         error.add_note(f"in a worker process:\n{trace.rstrip()}")

@@ -114,9 +114,9 @@ def find_places(
 ) -> tuple[FindReport, list[np.ndarray]]:
     """Find the places of a map that match a query, best first, and a box (2, 3) around each, map frame and unit.
 
-    Every capture that answers was described by one recipe: while a map moves to another embedder,
-    the old one answers until it has been described anew as a whole; words and pictures are asked of the present one.
-    Words that people gave objects as names or labels are answered by these, and no embedder is asked.
+    All captures are searched by one recipe: while a map moves to another embedder, the earlier one is searched until
+    the map has been described anew as a whole; words and pictures need the current one. Words that are the name or
+    label of an object need no embedder. Objects that are out of date are computed, and kept if the map can be written.
 
     Raises:
         NotFoundError: no poses yet, no such scene, node or object, or nothing stands at a point.

@@ -58,7 +58,8 @@ def rejected_places(
         if component in around:
             near = np.flatnonzero(_gaps(_box_in_map(place), around[component]) < margin_m)
             margin_m = min((_gap(place, claimed[component][i]) for i in near), default=margin_m)
-            margin_m = np.floor(100 * margin_m + 1e-3) / 100  # in whole centimetres: poses change by less
+            # In whole centimetres, since poses and rounding move gaps by less, and the margin is part of a tile's key.
+            margin_m = np.floor(100 * margin_m + 1e-3) / 100
         if margin_m >= 0:
             out.setdefault(scene, []).append(replace(place, margin_m=float(margin_m)))
     return out
@@ -84,9 +85,7 @@ def _box_in_map(place: UnchangedPlace) -> np.ndarray:
 
 def _gap(a: UnchangedPlace, b: UnchangedPlace) -> float:
     """Return the gap between two places, the second one as the box around it in the frame of the first."""
-    S = a.S_frame_map @ b.S_frame_map.inverse()
-    is_same = np.allclose(S.matrix(), np.eye(4), atol=1e-9)
-    return float(_gaps(a.box, b.box if is_same else moved_box(b.box, S)))
+    return float(_gaps(a.box, moved_box(b.box, a.S_frame_map @ b.S_frame_map.inverse())))
 
 
 def _gaps(box: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from operator import length_hint
 from typing import Any
 
 from gsmap import platform
-from gsmap.engine.blas_threads import one_blas_thread
+from gsmap.engine.blas_threads import run_with_one_blas_thread
 from gsmap.engine.pool import Pool
 from gsmap.errors import ConfigError
 
@@ -54,16 +54,13 @@ class LocalWorkers:
             if taken is None:
                 return
             began = time.monotonic()
-            with one_blas_thread():
-                result = job(*taken[1])
+            result = run_with_one_blas_thread(job, taken[1])
             took_s.append(time.monotonic() - began)
             yield taken[0], result
         first = list(islice(todo, 2))
         if len(first) == 1 and not self._pool.num_idle:
             index, args = first[0]
-            with one_blas_thread():
-                result = job(*args)
-            yield index, result
+            yield index, run_with_one_blas_thread(job, args)
             return
         yield from self._pool.run(job, chain(first, todo))
 

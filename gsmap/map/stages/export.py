@@ -256,7 +256,7 @@ def _digest(kept: Sequence[StoredPhoto]) -> str:
 
 
 def _digest_places(places: Mapping[str, Sequence[UnchangedPlace]]) -> str:
-    """Return a digest of boxes in their own frames; where these lie follows from the poses."""
+    """Return a digest of boxes in the frames of their comparisons; poses are compared apart (`dirty_reason`)."""
     rows = {scene: [[place.box, place.margin_m] for place in found] for scene, found in places.items()}
     return text_digest(canonical(plain(rows)))[:32]
 
