@@ -59,6 +59,16 @@ def test_nothing_is_outdated_where_the_changes_were_rejected():
     assert resolve_changes([replace(bare, unchanged=around), once], "best").num_removed == [0, 0]
 
 
+def test_a_change_beside_a_rejected_place_takes_nothing_of_it():
+    beside = replace(box(6), means=box(6).means + np.array([0.45, 0, 0], np.float32))
+    old, new = dated("old", 2020, wall(0, -1.5, 1.5), box(5), beside), dated("new", 2021, wall(1, -1.5, 1.5))
+    place = UnchangedPlace(Sim3.identity(), np.array([[0.25, -0.15, -0.5], [0.65, 0.15, -0.5]]), 0.02)
+    left = resolve_changes([replace(old, unchanged=(place,)), new]).scenes[0].gaussians.means
+    standing = left[left[:, 2] < -0.3]
+    assert (standing[:, 0] > 0.22).all()
+    assert len(standing) == len(beside)
+
+
 @pytest.mark.parametrize("bounds", [None, np.array([[-1.0, -1, -2], [1, 1, 1]])])
 def test_a_tile_keeps_what_stands_in_a_rejected_place(bounds):
     old, new = dated("old", 2020, wall(0, -1.5, 1.5), box(5)), dated("new", 2021, wall(1, -1.5, 1.5))

@@ -521,12 +521,17 @@ def test_two_captures_are_chosen_and_what_is_known_of_them_is_offered(hands, ser
     hands.says("no cycle confirms it", "gs-edge")
 
 
-def test_the_next_object_is_of_the_list_whatever_tab_is_open(hands):
+def filter_objects(hands, text: str, count: int) -> None:
+    """Open the list of objects and type a filter, which leaves some rows."""
     hands.press("4")
     hands.says("forklift", "gs-things")
     hands.click("#filter")
-    hands.type("r1")
-    hands.wait("findAll('[role=row]').length === 2")
+    hands.type(text)
+    hands.wait(f"findAll('[role=row]').length === {count}")
+
+
+def test_the_next_object_is_of_the_list_whatever_tab_is_open(hands):
+    filter_objects(hands, "r1", 2)
     hands.press("Escape", "j")
     hands.says("chair", "gs-thing")
     hands.press("1")
@@ -711,11 +716,7 @@ def test_an_object_is_seen_hovered_and_given_a_name(hands, server):
 
 
 def test_objects_and_photos(hands):
-    hands.press("4")
-    hands.says("forklift", "gs-things")
-    hands.click("#filter")
-    hands.type("red")
-    hands.wait("findAll('[role=row]').length === 1")
+    filter_objects(hands, "red", 1)
     hands.click("button.choose", "red cabinet")
     hands.says("chair stands beside red cabinet", "gs-thing")
     hands.says("r1, 12.0 m²", "gs-thing")
