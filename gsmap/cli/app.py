@@ -8,16 +8,21 @@ from __future__ import annotations
 
 import importlib
 import logging
+import pkgutil
 import platform
 import sys
 import tempfile
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
 from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import begin_output, left, print_json_error, print_wide_tables, start_logging
+from gsmap.cli.console import Output, begin_output, left, print_json_error, print_wide_tables, start_logging
 from gsmap.errors import (
     ConfigError,
     DiskFullError,
@@ -30,45 +35,47 @@ from gsmap.errors import (
 from gsmap.texts import escaped
 from gsmap.version import __version__
 
-PANELS = {
-    "Map": (
-        "init",
-        "ingest",
-        "update",
-        "describe",
-        "register",
-        "optimize",
-        "status",
-        "list",
-        "show",
-        "settings",
-        "demo",
-        "models",
-    ),
-    "Scenes and edges": (
-        "why",
-        "confirm",
-        "reject",
-        "edge",
-        "prior",
-        "edit",
-        "poses",
-        "georeference",
-        "measure",
-        "remove",
-        "restore-scene",
-    ),
-    "Changes over time": ("changes", "history", "diff", "thin"),
-    "View and query": ("view", "report", "graph", "find", "localize", "evaluate"),
-    "Export": ("export", "convert", "clean"),
-    "Branches and backups": ("branch", "tag", "merge", "split", "clone", "backup", "restore"),
-    "Maintenance": ("check", "prune", "migrate", "trust"),
-}
-"""Verbs by panel of ``gsmap -h``, in the order in which a new user needs them."""
+PANELS = (
+    "Map",
+    "Scenes and edges",
+    "Changes over time",
+    "View and query",
+    "Export",
+    "Branches and backups",
+    "Maintenance",
+)
+"""Panels of ``gsmap -h``."""
 
-VERBS = tuple(verb for panel in PANELS.values() for verb in panel)
-"""Each ``gsmap/cli/<verb>.py`` defines ``command`` (or ``app`` if it has sub-verbs),
-and ``TAKES_POINTS`` if an argument may be a point ``X,Y,Z``."""
+
+def verb_module(verb: str) -> ModuleType | None:
+    """Return the file of a verb, ``gsmap/cli/<verb>.py``; None if there is none.
+
+    It defines ``command`` (or ``app`` if it has sub-verbs), ``PANEL`` (its panel of ``gsmap -h``, and its place there),
+    ``OUTPUTS`` (what it prints with ``--json``), and ``TAKES_POINTS`` if an argument may be a point ``X,Y,Z``.
+    """
+    name = f"gsmap.cli.{verb.replace('-', '_')}"
+    if "_" in verb or not verb.isascii() or not verb.replace("-", "_").isidentifier() or not find_spec(name):
+        return None
+    module = importlib.import_module(name)
+    return module if hasattr(module, "PANEL") else None
+
+
+@cache
+def verbs() -> dict[str, ModuleType]:
+    """Return the files of all verbs, in the order of ``gsmap -h``, in which a new user needs them."""
+    names = [one.name.replace("_", "-") for one in pkgutil.iter_modules([str(Path(__file__).parent)])]
+    found = {name: module for name in names if (module := verb_module(name)) is not None}
+
+    def place(verb: str) -> tuple[int, int]:
+        panel, number = found[verb].PANEL
+        return PANELS.index(panel), number
+
+    return {verb: found[verb] for verb in sorted(found, key=place)}
+
+
+def outputs() -> dict[str, Output]:
+    """Return what each verb prints with ``--json``; verbs with several forms have one entry per form."""
+    return {form: output for module in verbs().values() for form, output in module.OUTPUTS.items()}
 
 
 def _version(value: bool) -> None:
@@ -93,8 +100,8 @@ def _root(
     print_wide_tables(wide)
 
 
-def build(verbs: Sequence[str] = VERBS) -> typer.Typer:
-    """Return the typer application with these verbs."""
+def build(modules: Mapping[str, ModuleType] | None = None) -> typer.Typer:
+    """Return the typer application with these verbs; default: all."""
     app = typer.Typer(
         name="gsmap",
         help="Map-management database for 3D Gaussian Splatting: merge many captures into one maintained map.",
@@ -104,15 +111,14 @@ def build(verbs: Sequence[str] = VERBS) -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     app.callback()(_root)
-    panels = {verb: panel for panel, members in PANELS.items() for verb in members}
-    for verb in verbs:
-        module = importlib.import_module(f"gsmap.cli.{verb.replace('-', '_')}")
+    for verb, module in (verbs() if modules is None else modules).items():
+        panel, _ = module.PANEL
         if hasattr(module, "app"):
-            app.add_typer(module.app, name=verb, rich_help_panel=panels[verb])
+            app.add_typer(module.app, name=verb, rich_help_panel=panel)
         else:
             # A point may begin with a minus sign, so an unknown option is an argument.
             points = {"ignore_unknown_options": True} if getattr(module, "TAKES_POINTS", False) else None
-            app.command(name=verb, context_settings=points, rich_help_panel=panels[verb])(module.command)
+            app.command(name=verb, context_settings=points, rich_help_panel=panel)(module.command)
     return app
 
 
@@ -130,7 +136,8 @@ def run(arguments: list[str] | None = None) -> None:
     first = next((one for one in given if not one.startswith("-")), "")
     reason = ""
     try:
-        build((first,) if first in VERBS else VERBS)(arguments)
+        module = verb_module(first)
+        build({first: module} if module else None)(arguments)
     except SystemExit as ended:
         if ended.code or not (message := left()):
             raise

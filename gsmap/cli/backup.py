@@ -6,8 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say
 
+PANEL = "Branches and backups", 6
+OUTPUTS = {"backup": Output("backups.BackupReport"), "backup --list": Output("backups.SnapshotRow", "snapshots")}
 Dest = Annotated[
     str,
     typer.Argument(

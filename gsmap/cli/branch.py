@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say
 
 if TYPE_CHECKING:
     from gsmap.types.rows.map_operations import BranchRow
+
+PANEL = "Branches and backups", 1
+OUTPUTS = {"branch": Output("map_operations.BranchRow", "branches")}
 
 
 def command(

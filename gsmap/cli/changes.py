@@ -11,6 +11,7 @@ from gsmap.cli.console import (
     AsOf,
     Executor,
     MapPath,
+    Output,
     Preset,
     Scheduler,
     Sets,
@@ -20,6 +21,9 @@ from gsmap.cli.console import (
     say,
 )
 from gsmap.texts import counted
+
+PANEL = "Changes over time", 1
+OUTPUTS = {"changes": Output("changes.ChangesReport")}
 
 
 def command(

@@ -6,8 +6,11 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say
 from gsmap.texts import shown
+
+PANEL = "Maintenance", 1
+OUTPUTS = {"check": Output("maps.CheckReport")}
 
 
 def command(

@@ -13,6 +13,8 @@ import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -108,22 +110,48 @@ def say_heights(rows: Sequence[Row]) -> None:
 # --- data ------------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Output:
+    """The JSON object that a verb prints with ``--json``: ``schema`` and the fields of a row, or rows under a key.
+
+    Args:
+        row: Module and class in `gsmap.types.rows`; a verb loads only the row classes that it prints.
+        key: Key of a list of rows, or of a row or null; empty for the fields of one row.
+        is_list: The key holds a list.
+    """
+
+    row: str
+    key: str = ""
+    is_list: bool = True
+
+    @property
+    def row_type(self) -> type[Row]:
+        module, name = self.row.split(".")
+        found: type[Row] = getattr(import_module(f"gsmap.types.rows.{module}"), name)
+        return found
+
+
+def output_of(verb: str) -> Output:
+    """Return the output of a verb, or of one of its forms, such as ``list scenes``, by `OUTPUTS` of its file."""
+    found: Output = import_module(f"gsmap.cli.{verb.split()[0].replace('-', '_')}").OUTPUTS[verb]
+    return found
+
+
 def print_rows(verb: str, rows: Row | Sequence[Row] | None, json: bool, title: str = "") -> None:
     """Print the rows of a verb on stdout, as one JSON object or as a table.
 
     Args:
-        verb: Key of the verb in `gsmap.cli.objects.OBJECTS`.
+        verb: Key in `OUTPUTS` of the verb's file.
         rows: Row or rows of the type declared there.
         title: Title of the table; default: the verb.
     """
     if json:
         print_json(json_object(verb, rows))
         return
-    from gsmap.cli.objects import OBJECTS
     from gsmap.types.rows.base import Row
 
     many = [] if rows is None else [rows] if isinstance(rows, Row) else list(rows)
-    print_table(title or verb, OBJECTS[verb].type.columns, many)
+    print_table(title or verb, output_of(verb).row_type.columns, many)
 
 
 _has_printed_json = _has_printed_table = False
@@ -152,21 +180,18 @@ def begin_output() -> None:
 
 def json_object(verb: str, rows: Row | Sequence[Row] | None) -> dict[str, Any]:
     """Return the object that a verb prints with ``--json``."""
-    from gsmap.cli.objects import OBJECTS, ManyRows, OptionalRow
     from gsmap.types.rows.base import SCHEMA, Row
 
-    shape = OBJECTS[verb]
-    for row in [rows] if isinstance(rows, Row) else rows or ():
-        if type(row) is not shape.type:
-            raise TypeError(f"{verb} prints {shape.type.__name__}, not {type(row).__name__}")
-    if isinstance(rows, Row):
-        data = rows.to_json()
-        return {"schema": SCHEMA, **({shape.key: data} if isinstance(shape, OptionalRow) else data)}
-    if isinstance(shape, ManyRows):
-        return {"schema": SCHEMA, shape.key: [row.to_json() for row in rows or ()]}
-    if isinstance(shape, OptionalRow):
-        return {"schema": SCHEMA, shape.key: None}
-    raise TypeError(f"{verb} prints one {shape.type.__name__}")
+    output, many = output_of(verb), [rows] if isinstance(rows, Row) else list(rows or ())
+    for row in many:
+        if type(row) is not output.row_type:
+            raise TypeError(f"{verb} prints {output.row_type.__name__}, not {type(row).__name__}")
+    data = [row.to_json() for row in many]
+    if output.key:
+        return {"schema": SCHEMA, output.key: data if output.is_list else data[0] if data else None}
+    if len(data) != 1:
+        raise TypeError(f"{verb} prints one {output.row_type.__name__}")
+    return {"schema": SCHEMA, **data[0]}
 
 
 def print_table(title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> None:

@@ -6,7 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, print_rows, say
+from gsmap.cli.console import AsJson, Output, print_rows, say
+
+PANEL = "Export", 2
+OUTPUTS = {"convert": Output("maps.ConvertReport")}
 
 
 def command(

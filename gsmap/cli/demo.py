@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, print_rows, print_table, progress_bars, say
+from gsmap.cli.console import AsJson, Output, print_rows, print_table, progress_bars, say
 
 if TYPE_CHECKING:
     from gsmap.map import Map
+
+PANEL = "Map", 11
+OUTPUTS = {"demo": Output("demo.DemoReport")}
 
 
 def command(

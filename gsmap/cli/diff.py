@@ -6,7 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows
+
+PANEL = "Changes over time", 3
+OUTPUTS = {"diff": Output("revisions.PoseChangeRow", "scenes")}
 
 
 def command(

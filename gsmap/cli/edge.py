@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say
 
 if TYPE_CHECKING:
     import numpy as np
 
     from gsmap.types import Sim3
 
+PANEL = "Scenes and edges", 4
+OUTPUTS = {"edge": Output("pairs.EdgeRow")}
 _RIGID_SIGMA = 1e-5  # standard deviation of the log scale of an edge without a scale
 
 

@@ -6,7 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows
+
+PANEL = "Scenes and edges", 6
+OUTPUTS = {"edit": Output("scenes.SceneRow"), "edit OBJECT": Output("objects.ObjectRow")}
 
 
 def command(

@@ -6,7 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_facts, print_rows, print_table
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_facts, print_rows, print_table
+
+PANEL = "View and query", 6
+OUTPUTS = {"evaluate": Output("evaluation.EvaluationReport")}
 
 
 def command(

@@ -14,6 +14,7 @@ from gsmap.cli.console import (
     AsOf,
     Executor,
     MapPath,
+    Output,
     Preset,
     Scheduler,
     Sets,
@@ -24,6 +25,8 @@ from gsmap.cli.console import (
 )
 from gsmap.cli.thin import parse_size
 
+PANEL = "Export", 1
+OUTPUTS = {"export": Output("exports.ExportReport"), "export --for": Output("exports.SmallMapReport")}
 _SURVEY_SUFFIXES = (".las", ".laz", ".tif", ".tiff", ".geojson", ".dxf")
 
 

@@ -6,8 +6,11 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, print_table, say
+from gsmap.cli.console import AsJson, MapPath, Output, Preset, Sets, opened, print_rows, print_table, say
 from gsmap.errors import ConfigError
+
+PANEL = "View and query", 4
+OUTPUTS = {"find": Output("find.FindReport")}
 
 
 def command(

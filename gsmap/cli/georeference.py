@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, Sets, opened, print_facts, print_rows, print_table, say
+from gsmap.cli.console import AsJson, MapPath, Output, Sets, opened, print_facts, print_rows, print_table, say
 
 if TYPE_CHECKING:
     from gsmap.types.rows.world import WorldReport
+
+PANEL = "Scenes and edges", 8
+OUTPUTS = {"georeference": Output("world.WorldReport")}
 
 
 def command(

@@ -6,7 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, print_table, say
+from gsmap.cli.console import AsJson, MapPath, Output, Preset, Sets, opened, print_rows, print_table, say
+
+PANEL = "View and query", 3
+OUTPUTS = {"graph": Output("objects.ObjectsReport")}
 
 
 def command(

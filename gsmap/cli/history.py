@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, print_table, say
+from gsmap.cli.console import AsJson, MapPath, Output, Preset, Sets, opened, print_rows, print_table, say
 
 if TYPE_CHECKING:
     from gsmap.types.rows.objects import HistoryReport
 
+PANEL = "Changes over time", 2
+OUTPUTS = {"history": Output("objects.HistoryReport")}
 TAKES_POINTS = True
 
 

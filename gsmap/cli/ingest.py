@@ -9,8 +9,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say
 
+PANEL = "Map", 2
+OUTPUTS = {"ingest": Output("scenes.IngestRow", "ingested")}
 Paths = Annotated[list[str] | None, typer.Argument(metavar="FILE_OR_FOLDER...", help="Files or folders of captures.")]
 CamerasFile = Annotated[
     str | None, typer.Option("--cameras", help="Camera file of the capture; only for a single capture.")

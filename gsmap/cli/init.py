@@ -6,7 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, print_rows, say
+
+PANEL = "Map", 1
+OUTPUTS = {"init": Output("maps.InitReport")}
 
 
 def command(

@@ -8,11 +8,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, AsOf, MapPath, opened, print_rows, say, say_heights
+from gsmap.cli.console import AsJson, AsOf, MapPath, Output, opened, print_rows, say, say_heights
 
 if TYPE_CHECKING:
     from gsmap.map import Map
     from gsmap.types.rows.base import Row
+
+PANEL = "Map", 8
+OUTPUTS = {
+    "list scenes": Output("scenes.SceneRow", "scenes"),
+    "list edges": Output("pairs.EdgeRow", "edges"),
+    "list revisions": Output("revisions.RevisionRow", "revisions"),
+    "list tiles": Output("exports.TileRow", "tiles"),
+    "list photos": Output("localize.PhotoRow", "photos"),
+}
 
 
 class ListKind(StrEnum):

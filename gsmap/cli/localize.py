@@ -10,6 +10,7 @@ from gsmap.cli.console import (
     AsJson,
     Executor,
     MapPath,
+    Output,
     Preset,
     Scheduler,
     Sets,
@@ -23,6 +24,9 @@ from gsmap.texts import counted
 
 if TYPE_CHECKING:
     from gsmap.types.rows.localize import LocalizeReport
+
+PANEL = "View and query", 5
+OUTPUTS = {"localize": Output("localize.LocalizeReport")}
 
 
 def command(

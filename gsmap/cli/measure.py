@@ -6,8 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, print_table, say, say_heights
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, print_table, say, say_heights
 
+PANEL = "Scenes and edges", 9
+OUTPUTS = {"measure": Output("world.MeasureReport")}
 TAKES_POINTS = True
 _POINT = "The first point: X,Y,Z in the map; SCENE:X,Y,Z; SCENE:CAMERA@COLUMN,ROW; world:X,Y,Z or EPSG:N:X,Y,Z."
 

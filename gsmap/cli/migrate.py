@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from gsmap.cli.console import AsJson, MapPath, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, print_rows, say
+
+PANEL = "Maintenance", 3
+OUTPUTS = {"migrate": Output("maps.MigrateReport")}
 
 
 def command(map: MapPath, json: AsJson = False) -> None:

@@ -6,8 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say
 
+PANEL = "Map", 12
+OUTPUTS = {"models add": Output("maps.ModelRow"), "models list": Output("maps.ModelRow", "models")}
 app = typer.Typer(
     no_args_is_help=True,
     help="Manage ONNX models: masks (`sam`), image and text features (`clip`), local features (`extractor`).",

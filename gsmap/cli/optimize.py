@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, Preset, Sets, opened, print_rows, say
+
+PANEL = "Map", 6
+OUTPUTS = {"optimize": Output("revisions.RevisionRow")}
 
 
 def command(map: MapPath, sets: Sets = None, preset: Preset = None, json: AsJson = False) -> None:

@@ -6,7 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say, say_heights
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say, say_heights
+
+PANEL = "Scenes and edges", 7
+OUTPUTS = {"poses": Output("scenes.PoseRow", "poses")}
 
 
 def command(

@@ -6,8 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say
 
+PANEL = "Scenes and edges", 5
+OUTPUTS = {"prior": Output("scenes.PriorRow", "prior", is_list=False)}
 # Standard deviations: an anchor is practically fixed; a tape measure is exact to one percent.
 _ANCHOR_RAD, _ANCHOR_M, _SCALE_SIGMA = 1e-4, 1e-4, 0.01
 

@@ -7,7 +7,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say
+
+PANEL = "Maintenance", 2
+OUTPUTS = {"prune": Output("maps.PruneReport")}
 
 
 def command(

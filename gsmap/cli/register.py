@@ -7,7 +7,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, Executor, MapPath, Preset, Scheduler, Sets, opened, print_rows
+from gsmap.cli.console import AsJson, Executor, MapPath, Output, Preset, Scheduler, Sets, opened, print_rows
+
+PANEL = "Map", 5
+OUTPUTS = {"register": Output("pairs.EdgeRow", "edges")}
 
 
 def command(

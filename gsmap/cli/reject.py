@@ -6,7 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say
+
+PANEL = "Scenes and edges", 3
+OUTPUTS = {"reject": Output("pairs.EdgeRow"), "reject CHANGE": Output("changes.ChangeRow")}
 
 
 def command(

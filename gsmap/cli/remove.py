@@ -6,10 +6,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say
 
 if TYPE_CHECKING:
     from gsmap.types.rows.map_operations import PurgeReport
+
+PANEL = "Scenes and edges", 10
+OUTPUTS = {
+    "remove": Output("scenes.SceneRow"),
+    "remove --purge": Output("map_operations.PurgeReport"),
+    "remove --photo": Output("localize.PhotoRow"),
+}
 
 
 def command(

@@ -7,7 +7,10 @@ from typing import Annotated
 import typer
 
 from gsmap.cli.backup import Dest
-from gsmap.cli.console import AsJson, print_rows, progress_bars, say
+from gsmap.cli.console import AsJson, Output, print_rows, progress_bars, say
+
+PANEL = "Branches and backups", 7
+OUTPUTS = {"restore": Output("backups.RestoreReport")}
 
 
 def command(

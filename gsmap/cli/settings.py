@@ -6,7 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say
+
+PANEL = "Map", 10
+OUTPUTS = {"settings": Output("maps.SettingRow", "settings")}
 
 
 def command(

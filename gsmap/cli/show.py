@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_facts, print_rows, print_table, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_facts, print_rows, print_table, say
 from gsmap.cli.history import print_history
 from gsmap.texts import shown
 
@@ -19,6 +19,13 @@ if TYPE_CHECKING:
     from gsmap.types.rows.pairs import PairReport
     from gsmap.types.rows.scenes import SceneReport
 
+PANEL = "Map", 9
+OUTPUTS = {
+    "show SCENE": Output("scenes.SceneReport"),
+    "show A:B": Output("pairs.PairReport"),
+    "show CHANGE": Output("changes.ChangeDetail"),
+    "show OBJECT": Output("objects.HistoryReport"),
+}
 _SHOWN = 8  # maximum number of edges, notes and events, so that everything fits a screen
 
 

@@ -6,7 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say
+
+PANEL = "Branches and backups", 4
+OUTPUTS = {"split": Output("map_operations.SplitReport")}
 
 
 def command(

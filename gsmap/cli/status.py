@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, print_table
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, print_table
 
+PANEL = "Map", 7
+OUTPUTS = {"status": Output("maps.MapStatus")}
 _SHOWN = 4  # number of components whose metric scale is printed, largest first
 
 

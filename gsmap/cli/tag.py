@@ -7,7 +7,10 @@ from typing import Annotated
 import typer
 
 from gsmap.cli.branch import make_or_list
-from gsmap.cli.console import AsJson, MapPath
+from gsmap.cli.console import AsJson, MapPath, Output
+
+PANEL = "Branches and backups", 2
+OUTPUTS = {"tag": Output("map_operations.BranchRow", "tags")}
 
 
 def command(

@@ -6,9 +6,11 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say
 from gsmap.errors import ConfigError
 
+PANEL = "Changes over time", 4
+OUTPUTS = {"thin": Output("thinning.ThinReport")}
 _UNITS = {"": 1, "B": 1} | {
     f"{prefix}{end}": base**power
     for power, prefix in enumerate("KMGT", 1)

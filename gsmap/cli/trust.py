@@ -7,8 +7,11 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, print_rows, say
 from gsmap.texts import shown
+
+PANEL = "Maintenance", 4
+OUTPUTS = {"trust": Output("trust.TrustReport")}
 
 
 def command(

@@ -7,13 +7,28 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, Executor, MapPath, Preset, Scheduler, Sets, opened, print_rows, print_table, say
+from gsmap.cli.console import (
+    AsJson,
+    Executor,
+    MapPath,
+    Output,
+    Preset,
+    Scheduler,
+    Sets,
+    opened,
+    print_rows,
+    print_table,
+    say,
+)
 from gsmap.cli.ingest import CapturedAt, Clean, NoCreate, makes_map, refuse_capture_as_map
 from gsmap.texts import escaped
 
 if TYPE_CHECKING:
     from gsmap.types.rows.pairs import EdgeRow
     from gsmap.types.rows.scenes import SceneRow
+
+PANEL = "Map", 3
+OUTPUTS = {"update": Output("revisions.UpdateReport")}
 
 
 def command(

@@ -11,8 +11,11 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_rows, say
 from gsmap.cli.stopping import StopSignal
+
+PANEL = "View and query", 1
+OUTPUTS = {"view": Output("maps.ViewReport")}
 
 
 @contextmanager

@@ -6,7 +6,10 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_facts, print_rows, print_table, say
+from gsmap.cli.console import AsJson, MapPath, Output, opened, print_facts, print_rows, print_table, say
+
+PANEL = "Scenes and edges", 1
+OUTPUTS = {"why A:B": Output("pairs.PairExplanation")}
 
 
 def command(

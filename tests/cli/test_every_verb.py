@@ -18,8 +18,7 @@ import gsmap
 import gsmap.map
 import gsmap_synthetic
 from gsmap import formats
-from gsmap.cli.app import build
-from gsmap.cli.objects import OBJECTS, ManyRows, OptionalRow
+from gsmap.cli.app import build, outputs
 from gsmap.store import trust
 from gsmap.types.localized_photo import LocalizedPhoto
 from tools.make.tiny_encoder import image_encoder
@@ -39,7 +38,7 @@ def verbs(command: Any = None, path: tuple[str, ...] = ()) -> Iterator[tuple[str
 
 VERBS = dict(verbs())
 
-# What is run for each verb (or each of its forms, as `gsmap.cli.objects` names them). MAP is a copy of the small map,
+# What is run for each verb (or each of its forms, as `OUTPUTS` of its file names them). MAP is a copy of the small map,
 # SITE that map itself.
 RUNS = {
     "init": "init TMP/new.gsmap",
@@ -170,7 +169,7 @@ def _link_captures(captures: Path, folder: Path) -> None:
 
 
 def test_no_verb_is_forgotten() -> None:
-    assert set(RUNS) == set(OBJECTS)
+    assert set(RUNS) == set(outputs())
     run = {line.split()[0] + (f" {line.split()[1]}" if line.startswith("models") else "") for line in RUNS.values()}
     assert run == set(VERBS)
 
@@ -200,11 +199,11 @@ def test_every_verb_prints_its_object_as_json(verb: str, gsmap_run: Callable[[st
     data = done.json
     assert next(iter(data)) == "schema"
     assert data["schema"] == 2
-    shape = OBJECTS[verb]
-    names = [field.name for field in fields(shape.type)]
-    if isinstance(shape, ManyRows | OptionalRow):
-        assert list(data) == ["schema", shape.key]
-        rows = data[shape.key] if isinstance(shape, ManyRows) else [data[shape.key]]
+    output = outputs()[verb]
+    names = [field.name for field in fields(output.row_type)]
+    if output.key:
+        assert list(data) == ["schema", output.key]
+        rows = data[output.key] if output.is_list else [data[output.key]]
         assert rows or verb == "models list"
         assert [list(row) for row in rows] == [names] * len(rows)
     else:

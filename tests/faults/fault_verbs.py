@@ -50,7 +50,7 @@ class Verb:
     @property
     def possible(self) -> bool:
         here = not self.needs or importlib.util.find_spec(self.needs) is not None
-        return here and self.line.split()[0] in app.VERBS
+        return here and self.line.split()[0] in app.verbs()
 
 
 BASES = {

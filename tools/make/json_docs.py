@@ -15,8 +15,10 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
+import typer.main
 
-from gsmap.cli.objects import OBJECTS, ManyRows, Object, OptionalRow
+from gsmap.cli.app import build, outputs
+from gsmap.cli.console import Output
 from gsmap.reason_codes import ERRORS, REASONS
 from gsmap.settings import field_docs
 from gsmap.types.rows.base import SCHEMA, Row
@@ -33,7 +35,7 @@ def page() -> str:
         "| verb | keys beside `schema` |",
         "| --- | --- |",
     ]
-    lines += [f"| `gsmap {_usage(verb)}` | {_shape(shape)} |" for verb, shape in OBJECTS.items()]
+    lines += [f"| `gsmap {_usage(verb)}` | {_shape(shape)} |" for verb, shape in outputs().items()]
     lines += ["", "## Rows\n"]
     for row in row_types():
         lines += section(row)
@@ -57,7 +59,7 @@ def section(row: type[Row]) -> list[str]:
 def row_types() -> list[type[Row]]:
     """Return every row class that a verb can print, each before the classes nested in it."""
     found: list[type[Row]] = []
-    todo = [shape.type for shape in OBJECTS.values()]
+    todo = [output.row_type for output in outputs().values()]
     while todo:
         row = todo.pop(0)
         if row not in found:
@@ -108,24 +110,23 @@ def _parts(hint: object) -> list[type[Row]]:
     return [row for part in typing.get_args(hint) for row in _parts(part)]
 
 
-def _shape(shape: Object) -> str:
-    link = f"[{shape.type.__name__}](#{shape.type.__name__.lower()})"
-    if isinstance(shape, ManyRows):
-        return f'`"{shape.key}"`: list of {link}'
-    if isinstance(shape, OptionalRow):
-        return f'`"{shape.key}"`: {link}, or null'
-    return f"the keys of {link}"
+def _shape(output: Output) -> str:
+    link = f"[{output.row_type.__name__}](#{output.row_type.__name__.lower()})"
+    if not output.key:
+        return f"the keys of {link}"
+    return f'`"{output.key}"`: list of {link}' if output.is_list else f'`"{output.key}"`: {link}, or null'
 
 
-def _usage(verb: str) -> str:
-    known = {"show SCENE": "show MAP SCENE", "show A:B": "show MAP A:B", "demo": "demo"}
-    known |= {"convert": "convert IN OUT", "clean": "clean IN OUT"}
-    known |= {"backup": "backup MAP DEST", "backup --list": "backup MAP DEST --list"}
-    known |= {"restore": "restore DEST MAP", "clone": "clone MAP NEW"}
-    words = verb.split()
-    if verb in known:
-        return known[verb]
-    return f"{verb} MAP" if words[0] != "list" else f"list MAP {words[1]}"
+def _usage(form: str) -> str:
+    """Return a form of a verb with its required arguments; an argument in the form is the last of them."""
+    command, words = typer.main.get_command(build()), form.split()
+    verb = []
+    while words and words[0] in getattr(command, "commands", {}):
+        verb.append(words.pop(0))
+        command = command.commands[verb[-1]]  # type: ignore[attr-defined]
+    needed = [one for one in command.params if one.param_type_name == "argument" and one.required]
+    arguments = [(one.metavar or str(one.name)).split("|")[0] for one in needed]
+    return " ".join([*verb, *(arguments[:-1] if words and not words[0].startswith("-") else arguments), *words])
 
 
 def _first(row: type[Row]) -> str:

@@ -20,7 +20,8 @@ from typing import Any
 import gsmap
 import gsmap.map
 import gsmap.render
-from gsmap.cli.objects import OBJECTS, ManyRows, OptionalRow
+from gsmap.cli.app import outputs
+from gsmap.cli.console import Output
 from gsmap.types.rows.base import SCHEMA
 from gsmap.version import __version__
 from tools.harness import argument_parser, say
@@ -44,7 +45,7 @@ def surface() -> dict[str, Any]:
     for row in row_types():
         hints = typing.get_type_hints(row)
         rows[row.__name__] = {field.name: json_type(hints[field.name]) for field in fields(row)}  # type: ignore[arg-type]
-    verbs = {verb: f"{_kind(shape)} {shape.type.__name__}" for verb, shape in OBJECTS.items()}
+    verbs = {verb: f"{_kind(output)} {output.row_type.__name__}" for verb, output in outputs().items()}
     return {"version": __version__, "python": python, "schema": SCHEMA, "rows": rows, "verbs": verbs}
 
 
@@ -105,8 +106,8 @@ def _parameters(value: Any) -> list[str]:
     return out
 
 
-def _kind(shape: object) -> str:
-    return "list of" if isinstance(shape, ManyRows) else "optional" if isinstance(shape, OptionalRow) else "one"
+def _kind(output: Output) -> str:
+    return "one" if not output.key else "list of" if output.is_list else "optional"
 
 
 def _is_error(value: object) -> bool:
