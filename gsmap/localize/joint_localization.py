@@ -117,7 +117,7 @@ def localize_together(
     out = []
     for state, one in zip(states, _combine_evidence(states, links, params.verdict.aliased_prior), strict=True):
         if one is None:
-            out.append(LocalizationResult(state.photo.name, state.reason))
+            out.append(LocalizationResult(state.reason, name=state.photo.name))
             continue
         best, rival, min_inliers = one
         found = make_placement(
@@ -133,8 +133,8 @@ def localize_together(
         )
         if state.displaced and found.is_placed:
             found = LocalizationResult(
-                found.name,
                 "ambiguous: other photos place it elsewhere",
+                name=found.name,
                 component=found.component,
                 probability=found.probability,
                 evidence=found.evidence,

@@ -84,7 +84,7 @@ def localize_photo(
     scaled, scale = scale_photo(photo, params.views.image_size_px)
     poses, rejection = evaluate_candidates(scaled, index, scenes, extractor, params)
     if not poses:
-        return LocalizationResult(photo.name, rejection)
+        return LocalizationResult(rejection, name=photo.name)
     rival = rival_probability(poses)
     return make_placement(photo.name, poses[0], rival, scaled, scale, scenes, params.verdict, metres_per_unit)
 
@@ -111,7 +111,9 @@ def make_placement(
     metres = (metres_per_unit or {}).get(component, 1.0)
     evidence = {**best.evidence, "rival": rival}
     if rejection:
-        return LocalizationResult(name, rejection, component=component, probability=best.probability, evidence=evidence)
+        return LocalizationResult(
+            rejection, name=name, component=component, probability=best.probability, evidence=evidence
+        )
     support, num_gaussians = _supporting_scenes(best, scenes, photo)
     pose = best.refined.T_metric_camera.copy()
     pose[:3, 3] /= metres
@@ -119,16 +121,16 @@ def make_placement(
     known = covariance.add_scene_covariance(best.covariance, best.refined.T_metric_camera, support)
     unit = np.r_[np.ones(3), np.full(3, 1 / metres)]
     return LocalizationResult(
-        name,
         "",
         pose,
         known * np.outer(unit, unit),
         component,
         tuple(scene.scene for scene, _ in support),
-        best.refined.intrinsics_px / scale,
         best.probability,
+        best.refined.intrinsics_px / scale,
         evidence,
         num_gaussians,
+        name=name,
     )
 
 

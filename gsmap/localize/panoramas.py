@@ -35,7 +35,7 @@ def combine_faces(photo: Photo, found: Sequence[LocalizationResult]) -> Localiza
         why = reason("ambiguous", "ambiguous: its faces are placed apart")
         first = best[0]
         return LocalizationResult(
-            photo.name, why, component=first.component, probability=first.probability, evidence=first.evidence
+            why, name=photo.name, component=first.component, probability=first.probability, evidence=first.evidence
         )
     return _mean(photo.name, best)
 

@@ -19,7 +19,8 @@ from gsmap.map.scan_localization import scan_rows
 from gsmap.map.stages.localize import Localizer, SearchRegion, localize, localize_all, parse_near
 from gsmap.store import Store
 from gsmap.texts import counted
-from gsmap.types.localization import LocalizationResult, Photo
+from gsmap.types.localization import LocalizationResult, Photo, PhotoLocalization
+from gsmap.types.plain import fields_of
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.localize import LocalizeReport, LocalizeRow
 
@@ -318,18 +319,11 @@ def row_of(names: Mapping[str, str], file: str, found: LocalizationResult, secon
     Args:
         names: scene names by id.
     """
-    return LocalizeRow(
-        file=file,
-        status="placed" if found.is_placed else "refused",
-        reason=found.reason,
-        reason_code=found.reason_code,
-        T_map_camera=found.T_map_camera,
-        covariance=found.covariance,
-        component=found.component,
-        scenes=tuple(names.get(scene, scene) for scene in found.scenes),
-        intrinsics_px=found.intrinsics_px,
-        probability=found.probability,
-        evidence=found.evidence,
-        num_gaussians=found.num_gaussians,
-        seconds=seconds,
-    )
+    row = {
+        "file": file,
+        "status": "placed" if found.is_placed else "refused",
+        "reason_code": found.reason_code,
+        "scenes": tuple(names.get(scene, scene) for scene in found.scenes),
+        "seconds": seconds,
+    }
+    return LocalizeRow(**fields_of(found, PhotoLocalization) | row)

@@ -12,8 +12,9 @@ from gsmap.formats import scans
 from gsmap.localize import Lens
 from gsmap.map.stages.localize_scan import Request, localize_scan
 from gsmap.store import Store
+from gsmap.types.plain import fields_of
 from gsmap.types.progress import StageProgress
-from gsmap.types.rows.localize import LocalizeRow
+from gsmap.types.rows.localize import LocalizedRow, LocalizeRow
 from gsmap.types.rows.localize_scan import ScanRow
 
 if TYPE_CHECKING:
@@ -56,18 +57,4 @@ def _row(file: str, row: ScanRow) -> LocalizeRow:
     evidence = {"num_points": float(row.num_points), "coloured": float(row.coloured)}
     if row.sigma_deg is not None and row.sigma_m is not None:
         evidence |= {"sigma_deg": row.sigma_deg, "sigma_m": row.sigma_m}
-    return LocalizeRow(
-        file=file,
-        status=row.status,
-        reason=row.reason,
-        reason_code=row.reason_code,
-        T_map_camera=row.T_map_camera,
-        S_map_scan=row.S_map_scan,
-        origin=row.origin,
-        covariance=row.covariance,
-        component=row.component,
-        scenes=row.scenes,
-        probability=row.probability,
-        evidence=evidence,
-        seconds=row.seconds,
-    )
+    return LocalizeRow(**fields_of(row, LocalizedRow) | {"file": file, "evidence": evidence})

@@ -89,10 +89,10 @@ def build_world_tie(system: System, solved: Solution, index: int, frame: WorldFr
         world,
         covariance * factor_of,
         world.scale,
-        float(np.sqrt(covariance[6, 6] * factor_of)),
-        frame,
-        tuple(rows),
         notes=tuple(notes),
+        scale_sigma=float(np.sqrt(covariance[6, 6] * factor_of)),
+        frame=frame,
+        residuals=tuple(rows),
         contradictions=solved.contradictions,
         variance_factor=factor_of,
     )

@@ -68,13 +68,13 @@ def _tie(value: dict[str, Any]) -> Georeference:
         to_pose(value["S_world_map"]),
         covariance,
         metres,
+        str(value["problem"]),
+        # missing in ties of earlier releases
+        str(value.get("problem_code", "undetermined" if value["problem"] else "")),
+        tuple(map(str, value["notes"])),
         float(value["scale_sigma"]),
         None if value["frame"] is None else WorldFrame(**value["frame"]),
         tuple(rows),
-        str(value["problem"]),
-        tuple(map(str, value["notes"])),
-        # missing in ties of earlier releases
-        str(value.get("problem_code", "undetermined" if value["problem"] else "")),
         tuple(_contradiction(one) for one in value.get("contradictions", [])),
         float(value.get("point_scatter", 1.0)),
         float(value.get("variance_factor", 1.0)),

@@ -115,32 +115,49 @@ class SceneFeatures:
 
 
 @dataclass(frozen=True, eq=False)
-class LocalizationResult:
-    """The pose of a photo, or the reason for refusing it.
+class Localization:
+    """The pose of a photo or scan in the map, or the reason for refusing it.
 
     Args:
-        name: name of the photo.
         reason: reason for the refusal; empty if it is placed.
-        T_map_camera: (4, 4) camera-to-map in the frame and unit of its component (OpenCV axes); None where refused.
-        covariance: (6, 6) over [rot_rad (3), trans (3)] on the camera's side, ``T = T_hat Exp(xi)``, map unit.
-        component: component of the pose.
-        scenes: ids of the supporting scenes, strongest first.
-        intrinsics_px: (4,) in the photo's own size, solved if they were unknown.
-        probability: probability that the pose is right; 0 without evidence.
-        evidence: evidence values by name.
-        num_gaussians: number of Gaussians of the supporting scenes in the photo's field of view.
+        T_map_camera: (4, 4) camera-to-map of a photo or depth image (OpenCV axes), in the frame and unit of its
+            component; None if it is refused, or has no camera.
+        covariance: (6, 6) of a photo over [rot_rad (3), trans (3)] on the camera's side, ``T = T_hat Exp(xi)``, map
+            unit; (7, 7) of a scan over [rot_rad (3), trans (3), log_scale] on the scan's side, in its own unit; None
+            if it is refused.
+        component: component of the pose; None if none was found.
+        scenes: supporting scenes, strongest first: ids, in rows names.
+        probability: probability that the pose is right, if refused of the best candidate; 0 without evidence.
     """
 
-    name: str
     reason: str
     T_map_camera: np.ndarray | None = None
     covariance: np.ndarray | None = None
     component: int | None = None
     scenes: tuple[str, ...] = ()
-    intrinsics_px: np.ndarray | None = None
     probability: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoLocalization(Localization):
+    """The localization of a photo.
+
+    Args:
+        intrinsics_px: (4,) ``fx fy cx cy`` in the photo's own size, specified or solved for; None for a scan.
+        evidence: evidence values by name.
+        num_gaussians: number of Gaussians of the supporting scenes in the photo's field of view.
+    """
+
+    intrinsics_px: np.ndarray | None = None
     evidence: Mapping[str, float] = field(default_factory=dict)
     num_gaussians: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizationResult(PhotoLocalization):
+    """The localization of a photo with its name."""
+
+    name: str = field(kw_only=True)
 
     @property
     def reason_code(self) -> str:

@@ -30,6 +30,11 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
+def fields_of(value: Any, cls: type) -> dict[str, Any]:
+    """Return the fields that an instance of a dataclass inherits from a class."""
+    return {field.name: getattr(value, field.name) for field in fields(cls)}
+
+
 def canonical(value: Any) -> str:
     """Return the canonical JSON text of a value, with sorted keys, for digests."""
     return of_plain(plain(value))

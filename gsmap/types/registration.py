@@ -62,8 +62,8 @@ class Proposal:
 
 
 @dataclass(frozen=True, eq=False)
-class Registration:
-    """The registration of a source scene in the frame of a target scene.
+class RegisteredPose:
+    """The pose of a source scene in the frame of a target scene, as registration found it.
 
     Args:
         target, source: scene ids.
@@ -78,6 +78,25 @@ class Registration:
         overlap: fraction of the smaller scene's surface that coincides, in [0, 1].
         proposer: which method's pose it is, and what that rests on: ``graph:landmarks``, ``graph:objects``,
             ``kiss_matcher``; ``manual`` where a person measured it; empty where there is none.
+    """
+
+    target: str
+    source: str
+    status: str
+    reason: str = ""
+    S_target_source: Sim3 | None = None
+    information: np.ndarray | None = None
+    num_inliers: int = 0
+    num_correspondences: int = 0
+    overlap: float = 0.0
+    proposer: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Registration(RegisteredPose):
+    """The registration of a source scene in the frame of a target scene.
+
+    Args:
         exact: true if the clique search proved its result largest.
         seconds: wall seconds by step (``match``, ``refine``, ``verdict``; ``fallback`` and ``polish`` where they ran).
         evidence: the figures that the verdict rests on, those of the best pose; empty where no pose was proposed. By
@@ -106,16 +125,6 @@ class Registration:
         notes: remarks on how it was computed (a package that is missing, ...).
     """
 
-    target: str
-    source: str
-    status: str
-    reason: str = ""
-    S_target_source: Sim3 | None = None
-    information: np.ndarray | None = None
-    num_inliers: int = 0
-    num_correspondences: int = 0
-    overlap: float = 0.0
-    proposer: str = ""
     exact: bool = True
     seconds: dict[str, float] = field(default_factory=dict)
     evidence: dict[str, float] = field(default_factory=dict)

@@ -303,38 +303,47 @@ class Contradiction:
 
 
 @dataclass(frozen=True, eq=False)
-class Georeference:
+class WorldPose:
     """The pose of a component in the world.
 
     Args:
-        component: its index in the pose graph.
-        S_world_map: component to world frame; None if the observations do not determine it.
-        covariance: (7, 7) of it over [rotation (3, rad), translation (3, map unit), log scale] on the map's side, with
-            the scene that holds the component's frame taken as exact; None as above.
+        component: component index, largest first.
+        S_world_map: component to world frame (metres east, north, up at its origin); None if the observations do not
+            determine it.
+        covariance: (7, 7) of ``S_world_map`` over [rotation (3, rad), translation (3, map unit), log scale] on the
+            map's side, with the scene that holds the component's frame taken as exact; None if it is not determined.
         metres_per_unit: metres per unit of the component's frame; None if unknown.
-        scale_sigma: standard deviation of its logarithm.
-        frame: the world frame; None if only lengths were observed.
-        residuals: residuals of all observations of the component.
         problem: reason why ``S_world_map`` is missing, or empty.
-        notes: remarks.
         problem_code: ``undetermined`` (observations are missing), ``contradiction`` (groups of observations contradict
-            each other and none is to be preferred), ``unsolved`` (no finite solution), or empty where there is no
-            problem.
-        contradictions: groups of observations that contradict each other.
-        point_scatter: factor by which the stated standard deviations of control points were multiplied.
-        variance_factor: factor by which ``covariance`` was multiplied, because observations scatter.
+            each other and nothing decides), ``unsolved`` (no finite solution), or empty.
+        notes: remarks.
     """
 
     component: int
     S_world_map: Sim3 | None = None
     covariance: np.ndarray | None = None
     metres_per_unit: float | None = None
+    problem: str = ""
+    problem_code: str = ""
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Georeference(WorldPose):
+    """The pose of a component in the world, with the observations that it was solved from.
+
+    Args:
+        scale_sigma: standard deviation of the logarithm of ``metres_per_unit``.
+        frame: the world frame; None if only lengths were observed.
+        residuals: residuals of all observations of the component.
+        contradictions: groups of observations that contradict each other.
+        point_scatter: factor by which the stated standard deviations of control points were multiplied.
+        variance_factor: factor by which ``covariance`` was multiplied, because observations scatter.
+    """
+
     scale_sigma: float = float("inf")
     frame: WorldFrame | None = None
     residuals: tuple[Residual, ...] = field(default=())
-    problem: str = ""
-    notes: tuple[str, ...] = ()
-    problem_code: str = ""
     contradictions: tuple[Contradiction, ...] = ()
     point_scatter: float = 1.0
     variance_factor: float = 1.0

@@ -163,7 +163,7 @@ def test_coordinates_name_their_frame_and_unit(row: type[Row]) -> None:
     """Components share no frame, so positions under each other say which component and unit they are in."""
     units = {"map units", "scene units", "m", "deg, map units"}
     lengths = ("position", "size", "sigma", "map", "at_m", "size_m", "box_m")
-    shown = {name for name in row.columns if getattr(row, "__annotations__", {}).get(name) != "str"}
+    shown = {name for name in row.columns if typing.get_type_hints(row).get(name) is not str}
     for name in shown:
         if name in lengths:
             heading = row.columns[name]

@@ -74,7 +74,7 @@ def test_wrong_models_and_panoramas_are_refused():
 
 def placed(face: str, pose: np.ndarray, probability: float = 0.9, component: int = 0) -> LocalizationResult:
     covariance = np.diag([1e-6] * 3 + [1e-4, 1e-4, 4e-4])
-    return LocalizationResult(face, "", pose, covariance, component, ("s",), np.full(4, 100.0), probability)
+    return LocalizationResult("", pose, covariance, component, ("s",), probability, np.full(4, 100.0), name=face)
 
 
 def test_faces_that_agree_place_their_photo():
@@ -84,7 +84,7 @@ def test_faces_that_agree_place_their_photo():
     photo = Photo(blank.rgb, np.ones(4), name="p", faces=tuple((blank, lens.R_photo_camera) for lens in views.lenses))
     truth = np.eye(4)
     truth[:3, :3], truth[:3, 3] = Rotation.from_rotvec([0.3, -2, 1]).as_matrix(), (1, 2, 3)
-    refused = LocalizationResult("f", "nothing in the map looks like it", probability=0.1)
+    refused = LocalizationResult("nothing in the map looks like it", probability=0.1, name="f")
 
     def seen(row: int, shift: float = 0.0) -> LocalizationResult:
         pose = truth.copy()

@@ -346,11 +346,13 @@ def retrieval_alone(held: World) -> Localise:
         found = extract_features(picture, localizer.extractor, SMOOTH_PX)
         views = retrieve_views(index, found, picture.intrinsics_px, 1)
         if not views:
-            return LocalizationResult(photo.name, "no view is like it"), time.process_time() - began
+            return LocalizationResult("no view is like it", name=photo.name), time.process_time() - began
         scene, view = views[0]
         placed = localizer.placed[scene]
         pose = _in_map(held, scene, placed.features.cameras.T_frame_camera[view])
-        return LocalizationResult(photo.name, "", pose, None, placed.component, (scene,)), time.process_time() - began
+        return LocalizationResult(
+            "", pose, None, placed.component, (scene,), name=photo.name
+        ), time.process_time() - began
 
     return localise
 
@@ -385,13 +387,19 @@ class Started:
         found = evaluate_pose(picture, start, localizer.placed, localizer.params.verdict.aliased_prior)
         seconds = time.process_time() - begin
         if found.covariance is None:
-            return LocalizationResult(photo.name, "nothing was found again"), seconds
+            return LocalizationResult("nothing was found again", name=photo.name), seconds
         answer = found.refined.T_metric_camera.copy()
         answer[:3, 3] /= unit
         side = np.r_[np.ones(3), np.full(3, 1 / unit)]
         known = found.covariance * np.outer(side, side)
         return LocalizationResult(
-            photo.name, "", answer, known, component, tuple(scenes), picture.intrinsics_px / scale
+            "",
+            answer,
+            known,
+            component,
+            tuple(scenes),
+            intrinsics_px=picture.intrinsics_px / scale,
+            name=photo.name,
         ), seconds
 
     def _metric(self, shot: Shot, scene: str) -> np.ndarray:
@@ -474,7 +482,7 @@ class PosedPhotos:
             rows, columns = match_features(mine, described)
             component = localizer.placed[scene].component
             parts.setdefault(component, []).append((scene, found.pixels[rows], points[columns]))
-        best, why = None, LocalizationResult(photo.name, "too few agree")
+        best, why = None, LocalizationResult("too few agree", name=photo.name)
         for component, held in parts.items():
             pixels, points = (np.concatenate([part[n] for part in held]).astype(np.float64) for n in (1, 2))
             if len(pixels) < 4:
@@ -492,7 +500,7 @@ class PosedPhotos:
             pose[:3, 3] /= localizer.metres.get(component, 1.0)
             ids = np.repeat(np.arange(len(held)), [len(part[1]) for part in held])
             most = np.bincount(ids[answer["inlier_mask"]], minlength=len(held)).argmax()
-            why = LocalizationResult(photo.name, "", pose, None, component, (held[most][0],))
+            why = LocalizationResult("", pose, None, component, (held[most][0],), name=photo.name)
         return why, time.process_time() - began
 
 

@@ -14,6 +14,8 @@ from gsmap.reason_codes import reason, reason_code
 from gsmap.store import Store
 from gsmap.store.registrations import StoredRegistration
 from gsmap.types import EdgeOutcome, Registration, Scene
+from gsmap.types.plain import fields_of
+from gsmap.types.registration import RegisteredPose
 from gsmap.types.rows.pairs import EdgeRow, PairEventRow, PairReport
 
 Outcomes = Mapping[tuple[str, str], EdgeOutcome]
@@ -115,27 +117,20 @@ def _edge_row(stored: StoredRegistration, outcomes: Outcomes, name_of: Mapping[s
         used = bool(used)  # a tentative edge holds its scenes; the person now confirms it in place of a cycle
     elif stored.review == "reject":
         status, why = "rejected", reason("rejected_by_person", "rejected by a person")
-    return EdgeRow(
-        target=edge.target,
-        target_name=name_of[edge.target],
-        source=edge.source,
-        source_name=name_of[edge.source],
-        status=status,
-        reason=why,
-        reason_code=reason_code(why),
-        S_target_source=edge.S_target_source,
-        scale=edge.scale,
-        information=edge.information,
-        num_inliers=edge.num_inliers,
-        num_correspondences=edge.num_correspondences,
-        overlap=edge.overlap,
-        seconds={step: edge.seconds.get(step, 0.0) for step in ("match", "refine", "verdict")},
-        used=used,
-        undecided=outcome is not None and outcome.undecided,
-        review=stored.review,
-        proposer=edge.proposer,
-        registered_at=stored.created_at,
-    )
+    row = {
+        "target_name": name_of[edge.target],
+        "source_name": name_of[edge.source],
+        "status": status,
+        "reason": why,
+        "reason_code": reason_code(why),
+        "scale": edge.scale,
+        "seconds": {step: edge.seconds.get(step, 0.0) for step in ("match", "refine", "verdict")},
+        "used": used,
+        "undecided": outcome is not None and outcome.undecided,
+        "review": stored.review,
+        "registered_at": stored.created_at,
+    }
+    return EdgeRow(**fields_of(edge, RegisteredPose) | row)
 
 
 _USED: dict[str, bool | str] = {"used": True, "tentative": "tentative", "unused": False}
@@ -181,13 +176,7 @@ def _never_registered(a: Scene, b: Scene) -> dict[str, Any]:
         "source": b.id,
         "source_name": b.name,
         "status": "never registered",
-        "reason": "",
-        "S_target_source": None,
         "scale": None,
-        "information": None,
-        "num_inliers": 0,
-        "num_correspondences": 0,
-        "overlap": 0.0,
         "seconds": {},
         "used": False,
     }

@@ -12,8 +12,9 @@ from gsmap.map.snapshot_read import snapshot_read
 from gsmap.reason_codes import reason_code
 from gsmap.store import Store
 from gsmap.types import ScenePose
+from gsmap.types.plain import fields_of
 from gsmap.types.rows.world import ContradictionRow, GeoreferenceRow, ResidualRow, ResidualSummaryRow, WorldReport
-from gsmap.types.world import Contradiction, Georeference, Residual, Survey
+from gsmap.types.world import Contradiction, Georeference, Residual, Survey, WorldPose
 
 
 @snapshot_read
@@ -65,21 +66,15 @@ def _tie_row(tie: Georeference, num_scenes: int, name_of: Mapping[str, str]) -> 
     controls = [row.error_m for row in tie.residuals if row.use == "used" and row.kind != "image"]
     checks = [row.error_m for row in tie.residuals if row.use == "check" and row.kind == "point"]
     return GeoreferenceRow(
-        component=tie.component,
+        **fields_of(tie, WorldPose),
         num_scenes=num_scenes,
-        S_world_map=tie.S_world_map,
-        covariance=tie.covariance,
-        metres_per_unit=tie.metres_per_unit,
         scale_sigma=tie.scale_sigma if np.isfinite(tie.scale_sigma) else None,
         rms_m=_rms(controls),
         rms_check_m=_rms(checks),
         num_outliers=sum(row.use == "outlier" for row in tie.residuals),
         by_kind=tuple(_by_kind(tie.residuals)),
         residuals=tuple(residual_row(row, name_of) for row in tie.residuals),
-        problem=tie.problem,
-        problem_code=tie.problem_code,
         contradictions=tuple(_contradiction_row(one, name_of) for one in tie.contradictions),
-        notes=tie.notes,
     )
 
 

@@ -53,12 +53,10 @@ class TileRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SmallSceneRow(Row):
+class SmallSceneRow(SceneRef):
     """The content of a scene in a small map.
 
     Args:
-        scene: id.
-        scene_name: name.
         num_views: number of views for retrieval.
         num_features: number of stored features.
         features_of: number of features before reduction.
@@ -77,8 +75,6 @@ class SmallSceneRow(Row):
         "num_bytes": "bytes",
     }
 
-    scene: str
-    scene_name: str
     num_views: int
     num_features: int
     features_of: int

@@ -9,10 +9,11 @@ from typing import ClassVar
 import numpy as np
 
 from gsmap.types.rows.base import Row
+from gsmap.types.rows.scenes import SceneRef
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FindHit(Row):
+class FindHit(SceneRef):
     """A place in the map that matches the query.
 
     Args:
@@ -48,8 +49,6 @@ class FindHit(Row):
     rank: int
     score: float
     object: str | None
-    scene: str
-    scene_name: str
     node: int | None
     component: int
     position: np.ndarray

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
+from gsmap.types.localization import Localization, PhotoLocalization
 from gsmap.types.rows.base import Row
+from gsmap.types.rows.scenes import SceneRef
 from gsmap.types.sim3 import Sim3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PhotoChangeRow(Row):
+class PhotoChangeRow(SceneRef):
     """A region of a localized photo that differs from the map.
 
     Args:
@@ -25,7 +27,7 @@ class PhotoChangeRow(Row):
         position: centre of the map's content there; frame and unit of the photo's component.
         object: id of the nearest object (`gsmap graph`); null if there is none.
         scene: id of the capture that the photo was compared with.
-        scene_name: name of that capture.
+        scene_name: name of the capture that the photo was compared with.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -44,32 +46,35 @@ class PhotoChangeRow(Row):
     strength: float
     position: np.ndarray
     object: str | None
-    scene: str
-    scene_name: str
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LocalizeRow(Row):
-    """The result for one photo, video frame or scan.
+class LocalizedRow(Localization, Row):
+    """A localized file.
 
     Args:
         file: file as given; ``FILE#SECONDS`` for a video frame.
         status: ``placed`` or ``refused``.
-        reason: reason for the refusal; empty if it is placed.
         reason_code: code of the reason, a key of `gsmap.reason_codes.REASONS`, or empty.
-        T_map_camera: (4, 4) camera-to-map of a photo (OpenCV axes), in the frame and unit of its component; else null.
         S_map_scan: scan coordinates, less ``origin``, to the map, frame and unit of its component; null for photos and
             refused scans.
         origin: offset subtracted from the scan's coordinates: zeros unless they are large; null for photos.
-        covariance: (6, 6) over [rot_rad (3), trans (3)], of a scan (7, 7) with the logarithm of its scale, on the
-            camera's or scan's side: ``T = T_hat Exp(xi)``, translation in the map's unit (a scan's: in its own).
-        component: component of the pose; null if none was found.
-        scenes: names of the supporting scenes, strongest first.
-        intrinsics_px: (4,) ``fx fy cx cy`` of the photo, given or solved for; null for a scan.
-        probability: probability that the pose is right; 0 without evidence.
-        evidence: evidence values by name.
-        num_gaussians: number of Gaussians of the supporting scenes in the photo's field of view.
-        seconds: wall time in seconds.
+        seconds: wall time in seconds, of a scan CPU time.
+    """
+
+    file: str
+    status: str
+    reason_code: str = ""
+    S_map_scan: Sim3 | None = None
+    origin: np.ndarray | None = None
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LocalizeRow(PhotoLocalization, LocalizedRow):
+    """The result for one photo, video frame or scan.
+
+    Args:
         changes: regions that differ from the map, clearest first; null if not requested.
         compared: fraction of the image that was compared; null if not requested.
         picture: image file with these regions drawn; null if not requested.
@@ -87,21 +92,6 @@ class LocalizeRow(Row):
         "reason": "reason",
     }
 
-    file: str
-    status: str
-    reason: str
-    reason_code: str = ""
-    T_map_camera: np.ndarray | None = None
-    S_map_scan: Sim3 | None = None
-    origin: np.ndarray | None = None
-    covariance: np.ndarray | None = None
-    component: int | None = None
-    scenes: tuple[str, ...] = ()
-    intrinsics_px: np.ndarray | None = None
-    probability: float = 0.0
-    evidence: Mapping[str, float] = field(default_factory=dict)
-    num_gaussians: int = 0
-    seconds: float = 0.0
     changes: tuple[PhotoChangeRow, ...] | None = None
     compared: float | None = None
     picture: str | None = None
@@ -125,7 +115,7 @@ class LocalizeRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PhotoRow(Row):
+class PhotoRow(SceneRef):
     """A photo stored in the map, with its pose in the newest revision.
 
     Args:
@@ -169,8 +159,6 @@ class PhotoRow(Row):
     intrinsics_px: np.ndarray
     size_px: tuple[int, int]
     probability: float
-    scene: str
-    scene_name: str
     num_seen: int
     num_absent: int
     added_at: str

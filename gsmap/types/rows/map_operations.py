@@ -44,17 +44,36 @@ class BranchRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MergeReport(Row):
+class CopyReport(Row):
+    """Items copied from one map to another.
+
+    Args:
+        map: folder of the target map.
+        from_map: the source map, which stays unchanged.
+        num_graphs: number of scene graphs.
+        num_registrations: number of registrations of pairs.
+        revision: revision with the newest poses; null if none was needed.
+        num_bytes: size of new arrays, linked or copied.
+        notes: remarks: settings that differ, scenes that stay removed or apart.
+    """
+
+    map: str
+    from_map: str
+    num_graphs: int
+    num_registrations: int
+    revision: int | None
+    num_bytes: int
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MergeReport(CopyReport):
     """The numbers of items copied from another map; all are 0 if nothing was new.
 
     Args:
-        map: the target map.
-        from_map: the source map, which stays unchanged.
         num_scenes: scenes that are new or alive again.
         num_removed: scenes that are removed now, or came as removed scenes of older revisions.
         num_known: scenes that both maps had.
-        num_graphs: scene graphs.
-        num_registrations: registrations of pairs.
         num_reviews: reviews of pairs.
         num_facts: names, dates, notes and tags.
         num_priors: priors.
@@ -67,9 +86,6 @@ class MergeReport(Row):
         num_object_facts: annotations of objects.
         num_revisions: revisions, as history.
         renamed: new name of each scene whose name was taken, by the old one.
-        revision: revision with the newest poses of both maps; null if none was needed.
-        num_bytes: size of new arrays, linked or copied.
-        notes: remarks: settings that differ, scenes that stay removed or apart.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -82,13 +98,9 @@ class MergeReport(Row):
         "num_bytes": "bytes",
     }
 
-    map: str
-    from_map: str
     num_scenes: int
     num_removed: int
     num_known: int
-    num_graphs: int
-    num_registrations: int
     num_reviews: int
     num_facts: int
     num_priors: int
@@ -101,24 +113,14 @@ class MergeReport(Row):
     num_object_facts: int
     num_revisions: int
     renamed: Mapping[str, str]
-    revision: int | None
-    num_bytes: int
-    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SplitReport(Row):
+class SplitReport(CopyReport):
     """A map made from a part of another.
 
     Args:
-        map: folder of the new map.
-        from_map: the source map, which stays unchanged.
         scene_names: names of its scenes.
-        num_graphs: number of scene graphs.
-        num_registrations: number of registrations among its scenes.
-        revision: number of the revision with their newest poses; null if they had none.
-        num_bytes: size of its arrays, linked or copied.
-        notes: remarks.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -129,14 +131,7 @@ class SplitReport(Row):
         "num_bytes": "bytes",
     }
 
-    map: str
-    from_map: str
     scene_names: tuple[str, ...]
-    num_graphs: int
-    num_registrations: int
-    revision: int | None
-    num_bytes: int
-    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

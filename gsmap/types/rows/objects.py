@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from gsmap.types.rows.base import Row
+from gsmap.types.rows.scenes import FactRow, SceneRef
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -141,7 +142,7 @@ class ObjectsReport(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ObjectObservationRow(Row):
+class ObjectObservationRow(SceneRef):
     """The observation of an object by one capture.
 
     Args:
@@ -168,8 +169,6 @@ class ObjectObservationRow(Row):
     }
 
     object: str
-    scene: str
-    scene_name: str
     captured_at: str | None
     state: str
     box: np.ndarray | None
@@ -179,15 +178,12 @@ class ObjectObservationRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ObjectFactRow(Row):
+class ObjectFactRow(FactRow):
     """An annotation of an object.
 
     Args:
         object: object id.
-        at: time of the annotation, ISO 8601.
         fact: ``name``, ``label``, ``note`` or ``same_as``.
-        value: text; empty if the previous annotation was removed.
-        author: author; empty for an unnamed person.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -199,10 +195,6 @@ class ObjectFactRow(Row):
     }
 
     object: str
-    at: str
-    fact: str
-    value: str
-    author: str = ""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -6,10 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
-
+from gsmap.types.registration import RegisteredPose
 from gsmap.types.rows.base import Row
-from gsmap.types.sim3 import Sim3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -37,7 +35,7 @@ class PairRef(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class EdgeRow(PairRef):
+class EdgeRow(RegisteredPose, PairRef):
     """The current edge of a registered pair.
 
     Args:
@@ -45,19 +43,11 @@ class EdgeRow(PairRef):
             a review takes precedence.
         reason: reason why it is not accepted or not used, or empty.
         reason_code: code of the reason, a key of `gsmap.reason_codes.REASONS`, or empty.
-        S_target_source: pose of the source in the target; null if none was found.
-        scale: scale of that pose; null if none was found.
-        information: (7, 7) over [rotation (3, rad), translation (3), log scale] applied on the source side,
-            translation in the source's unit; null where no pose was found.
-        num_inliers: number of inliers.
-        num_correspondences: number of candidate correspondences.
-        overlap: fraction of the smaller scene's surface that coincides, in [0, 1].
+        scale: scale of the pose; null if none was found.
         seconds: wall time in seconds of ``match``, ``refine`` and ``verdict``.
         used: use by the last optimize: true, false, or ``"tentative"`` (neither a cycle nor a review confirms it).
         undecided: true if another group of edges contradicts it and nothing decides between them.
         review: standing review: ``confirm`` or ``reject``; null if unreviewed.
-        proposer: source of the pose (``graph:landmarks``, ``graph:objects``, ``kiss_matcher``), ``manual`` for a
-            measured pose; empty if none was found.
         registered_at: time of the registration, ISO 8601 with zone.
     """
 
@@ -83,20 +73,12 @@ class EdgeRow(PairRef):
             return "used"
         return "unused" if self.status == "accepted" else ""
 
-    status: str
-    reason: str
     reason_code: str = ""
-    S_target_source: Sim3 | None
     scale: float | None
-    information: np.ndarray | None
-    num_inliers: int
-    num_correspondences: int
-    overlap: float
     seconds: Mapping[str, float]
     used: bool | str
     undecided: bool = False
     review: str | None = None
-    proposer: str = ""
     registered_at: str | None = None
 
 

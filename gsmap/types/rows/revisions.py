@@ -62,12 +62,10 @@ class RevisionRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PoseChangeRow(Row):
+class PoseChangeRow(SceneRef):
     """The difference of a scene's pose between two revisions.
 
     Args:
-        scene: id.
-        scene_name: name.
         change: ``added``, ``removed``, ``moved`` or ``same``.
         rotation_deg: rotation angle; null if the scene is in only one of the two.
         translation_m: displacement of the scene's centre, by the metric scale of the later revision; null if the scene
@@ -89,8 +87,6 @@ class PoseChangeRow(Row):
         "status_after": "status",
     }
 
-    scene: str
-    scene_name: str
     change: str
     rotation_deg: float | None
     translation_m: float | None

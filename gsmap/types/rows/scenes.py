@@ -29,7 +29,31 @@ class SceneRef(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SceneRow(Row):
+class WorldPosition(Row):
+    """The position of a scene in the world.
+
+    Args:
+        world: (3,) position of its origin in the CRS; null if the map is not georeferenced.
+        crs: CRS of ``world``; null if the map is not georeferenced.
+        heights: unit and zero of heights in the CRS, such as metres above the ellipsoid; null if the map is not
+            georeferenced.
+        offset: (3,) offset subtracted from the coordinates of its file if these exceed single precision, as map
+            coordinates do; else zeros. ``S_map_scene`` maps the file's coordinates less this.
+    """
+
+    world: np.ndarray | None = None
+    crs: str | None = None
+    heights: str | None = None
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def in_world(self) -> str | None:
+        """World coordinates of the scene's origin as text."""
+        return coordinates(self.world)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SceneRow(WorldPosition):
     """A capture in the map.
 
     Args:
@@ -50,12 +74,6 @@ class SceneRow(Row):
         metres_per_unit: metres per unit of its component's frame, see ``gsmap status``; null if unknown.
         metric: (3,) position of its origin, metres east, north, up of the world frame; null if the map is not
             georeferenced (``gsmap georeference``).
-        world: (3,) position of its origin in the map's CRS; null if the map is not georeferenced.
-        crs: CRS of ``world``; null if the map is not georeferenced.
-        heights: unit and zero of heights in the CRS, such as metres above the ellipsoid; null if the map is not
-            georeferenced.
-        offset: (3,) offset subtracted from the coordinates of its file if these exceed single precision, as map
-            coordinates do; else zeros.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -86,20 +104,11 @@ class SceneRow(Row):
     note: str = ""
     metres_per_unit: float | None = None
     metric: np.ndarray | None = None
-    world: np.ndarray | None = None
-    crs: str | None = None
-    heights: str | None = None
-    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def standing(self) -> str:
         """The status in a word of tables: ``one pair`` for a tentative scene that nothing puts in doubt."""
         return "one pair" if self.one_pair else self.status
-
-    @property
-    def in_world(self) -> str | None:
-        """World coordinates of the scene's origin as text."""
-        return coordinates(self.world)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -160,7 +169,7 @@ class NodeRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SceneEdgeRow(Row):
+class SceneEdgeRow(SceneRef):
     """An edge of a scene.
 
     Args:
@@ -183,8 +192,6 @@ class SceneEdgeRow(Row):
         "reason": "reason",
     }
 
-    scene: str
-    scene_name: str
     status: str
     used: bool | str
     overlap: float
@@ -215,7 +222,7 @@ class FactRow(Row):
     Args:
         at: time of the annotation, ISO 8601 with zone.
         fact: ``name``, ``captured_at``, ``note``, ``tag`` or ``untag``.
-        value: text; empty if a date was removed.
+        value: text; empty if the previous value was removed.
         author: author or source (such as the EXIF of a frame); empty for an unnamed person.
     """
 
@@ -280,11 +287,10 @@ class SceneReport(SceneRow):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class IngestRow(Row):
+class IngestRow(SceneRef):
     """The result of ingesting one capture.
 
     Args:
-        scene: id.
         scene_name: name, which differs from the requested one if that was taken.
         new: true if it was added; false if the map had the same content already.
         num_gaussians: number of Gaussians.
@@ -301,8 +307,6 @@ class IngestRow(Row):
         "outcome": "outcome",
     }
 
-    scene: str
-    scene_name: str
     new: bool
     num_gaussians: int
     notes: tuple[str, ...] = ()
@@ -320,12 +324,10 @@ class IngestRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class GraphRow(Row):
+class GraphRow(SceneRef):
     """The scene graph of one scene.
 
     Args:
-        scene: id.
-        scene_name: name.
         num_nodes: number of nodes of all layers.
         layers: node layers.
         up: (3,) up direction in the scene's frame; null if unknown.
@@ -341,8 +343,6 @@ class GraphRow(Row):
         "notes": "notes",
     }
 
-    scene: str
-    scene_name: str
     num_nodes: int
     layers: tuple[LayerRow, ...]
     up: np.ndarray | None
@@ -357,22 +357,15 @@ class GraphRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PoseRow(Row):
+class PoseRow(SceneRef, WorldPosition):
     """The pose of a scene.
 
     Args:
-        scene: id.
-        scene_name: name.
         component: index of its connected component, largest first; components share no frame.
         status: ``placed``, ``tentative`` or ``isolated``, as in `SceneRow`.
         S_map_scene: pose in the frame of its component.
         S_world_scene: pose in the world frame (metres east, north, up); null if the map is not georeferenced.
-        world: (3,) position of its origin in the CRS; null if the map is not georeferenced.
-        crs: CRS of ``world``; null if the map is not georeferenced.
-        heights: unit and zero of heights in the CRS, such as metres above the ellipsoid; null if the map is not
-            georeferenced.
         covariance: (7, 7) over [rotation (3, rad), translation (3), log scale] on the scene side; null if unknown.
-        offset: (3,) offset of `SceneRow`: ``S_map_scene`` maps the file's coordinates less this.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -384,17 +377,11 @@ class PoseRow(Row):
         "in_world": "world",
     }
 
-    scene: str
-    scene_name: str
     component: int
     status: str
     S_map_scene: Sim3
     S_world_scene: Sim3 | None = None
     covariance: np.ndarray | None = None
-    world: np.ndarray | None = None
-    crs: str | None = None
-    heights: str | None = None
-    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def position(self) -> np.ndarray:
@@ -405,8 +392,3 @@ class PoseRow(Row):
     def scale(self) -> float:
         """Map units per unit of the scene."""
         return self.S_map_scene.scale
-
-    @property
-    def in_world(self) -> str | None:
-        """World coordinates of the scene's origin as text."""
-        return coordinates(self.world)

@@ -9,8 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from gsmap.types.rows.base import Row, coordinates
-from gsmap.types.sim3 import Sim3
-from gsmap.types.world import Contradiction, Residual
+from gsmap.types.world import Contradiction, Residual, WorldPose
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -110,28 +109,18 @@ class ContradictionRow(Contradiction, Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class GeoreferenceRow(Row):
+class GeoreferenceRow(WorldPose, Row):
     """The pose of a component in the world.
 
     Args:
-        component: component index, largest first.
         num_scenes: number of scenes.
-        S_world_map: component to world frame (metres east, north, up at ``origin``); null if the observations do not
-            determine it.
-        covariance: (7, 7) of ``S_world_map`` over [rotation (3, rad), translation (3, map unit), log scale] on the
-            map's side; null if it is not determined.
-        metres_per_unit: metres per unit of its frame; null if unknown.
         scale_sigma: standard deviation of the logarithm of ``metres_per_unit``; null if unknown.
         rms_m: root mean square error of the used control points, fixes and bars; null without any.
         rms_check_m: root mean square error of the check points; null without any.
         num_outliers: number of outliers.
         by_kind: summary of the residuals of each kind of observation.
         residuals: residuals of all its observations.
-        problem: reason why ``S_world_map`` is missing, or empty.
-        problem_code: ``undetermined`` (observations are missing), ``contradiction`` (groups contradict each other and
-            nothing decides), ``unsolved`` (no finite solution), or empty.
         contradictions: groups of observations that contradict each other.
-        notes: remarks.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -144,21 +133,14 @@ class GeoreferenceRow(Row):
         "problem": "problem",
     }
 
-    component: int
     num_scenes: int
-    S_world_map: Sim3 | None
-    covariance: np.ndarray | None
-    metres_per_unit: float | None
     scale_sigma: float | None
     rms_m: float | None
     rms_check_m: float | None
     num_outliers: int
     by_kind: tuple[ResidualSummaryRow, ...]
     residuals: tuple[ResidualRow, ...]
-    problem: str
-    problem_code: str
     contradictions: tuple[ContradictionRow, ...]
-    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
