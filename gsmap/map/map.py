@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from gsmap.types import Cameras, Change, Gaussians, PoseGraph, Prior, Scene, Sce
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.base import Table
+from gsmap.types.scene import SceneEdits
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -1254,35 +1255,24 @@ class Map(AbstractContextManager["Map"]):
         self,
         ref: str,
         *,
-        name: str | None = None,
-        captured_at: str | None = None,
-        note: str | None = None,
         tags: Sequence[str] = (),
         untag: Sequence[str] = (),
-        metres_per_unit: float | None = None,
         author: str = "",
+        **edits: Unpack[SceneEdits],
     ) -> SceneRow:
         """Edit a scene's name, date, notes and tags (``gsmap edit MAP SCENE``); its history keeps earlier values.
 
         Args:
-            captured_at: ISO 8601, UTC if it has no zone; ``none`` removes the date.
-            metres_per_unit: metres per unit of the scene's own frame; 0 removes it.
+            tags, untag: tags to add and to remove.
             author: author of the edit.
+            edits: new ``name``, ``captured_at`` (``none`` removes the date), ``note`` or ``metres_per_unit`` (of the
+                scene's own frame; 0 removes it).
         """
         from gsmap.ingest import given_date
 
-        if captured_at is not None:
-            captured_at = "" if captured_at.strip().lower() == "none" else given_date(captured_at).when
-        scene = self.store.scenes.edit(
-            ref,
-            name=name,
-            captured_at=captured_at,
-            note=note,
-            tags_add=tuple(tags),
-            tags_remove=tuple(untag),
-            metres_per_unit=metres_per_unit,
-            author=author,
-        )
+        if (date := edits.get("captured_at")) is not None:
+            edits["captured_at"] = "" if date.strip().lower() == "none" else given_date(date).when
+        scene = self.store.scenes.edit(ref, tags_add=tuple(tags), tags_remove=tuple(untag), author=author, **edits)
         return reports.scene_row(self.store, scene, self.metres())
 
     def photo_rows(self) -> list[PhotoRow]:

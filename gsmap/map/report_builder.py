@@ -333,7 +333,6 @@ def _state(store: Store, settings: Settings, since: str | None) -> _CatalogState
     edges = reports.edge_rows(store)
     revisions = reports.revision_rows(store)
     num_bytes = scene_sizes(store)
-    cameras = {scene.id: scene.num_cameras for scene in scenes}
     found = status(store, settings)
     places = _places(store)
     changes = None if graph is None else _known_changes(store, settings, since)
@@ -343,10 +342,7 @@ def _state(store: Store, settings: Settings, since: str | None) -> _CatalogState
         made_at=datetime.now(UTC).isoformat(timespec="seconds"),
         version=__version__,
         status=_hide_places(found, places),
-        scenes=tuple(
-            SceneEntry(row, cameras.get(row.id, 0), num_bytes.get(row.id, 0))
-            for row in reports.scene_rows(store, metres=metres)
-        ),
+        scenes=tuple(SceneEntry(row, num_bytes.get(row.id, 0)) for row in reports.scene_rows(store, metres=metres)),
         revisions=tuple(revisions[-_REVISIONS:]),
         num_revisions=len(revisions),
         moved=tuple(_moved(store, revisions)),

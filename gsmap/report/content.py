@@ -30,7 +30,6 @@ class SceneEntry:
 
     Args:
         row: Row of the scene as in `gsmap list`.
-        num_cameras: Number of cameras.
         num_bytes: Size of the stored arrays.
         middle: (3,) reference point of the uncertainty in the component frame: centre of the cameras, or of the
             Gaussians if there are no cameras; None if the scene has no pose.
@@ -39,7 +38,6 @@ class SceneEntry:
     """
 
     row: SceneRow
-    num_cameras: int = 0
     num_bytes: int = 0
     middle: np.ndarray | None = None
     covariance_m2: np.ndarray | None = None

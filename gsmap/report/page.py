@@ -446,7 +446,7 @@ def _scenes(report: Report) -> Markup | None:
             angle(entry.rotation_sigma_deg),
             str(edges.get(entry.row.id, 0)),
             f"{entry.row.num_gaussians:,}",
-            f"{entry.num_cameras:,}",
+            f"{entry.row.num_cameras:,}",
             size(entry.num_bytes),
             joined([tag("span", one, class_="chip") for one in entry.row.tags], entry.row.note),
         )

@@ -15,6 +15,7 @@ from gsmap.store.catalog import now
 from gsmap.store.scene_refs import is_hexadecimal
 from gsmap.store.schema import scene_facts
 from gsmap.texts import control_characters
+from gsmap.types.scene import SCENE_FACTS, SceneEdits
 
 
 @dataclass(frozen=True)
@@ -22,8 +23,8 @@ class Fact:
     """An annotation that a person gave a scene or an object.
 
     Args:
-        kind: of a scene ``name``, ``captured_at``, ``note``, ``tag``, ``untag`` or ``metres_per_unit``; of an object
-            one of `gsmap.types.map_object.OBJECT_FACTS`.
+        kind: of a scene one of `gsmap.types.scene.SCENE_FACTS`, of an object one of
+            `gsmap.types.map_object.OBJECT_FACTS`.
         value: the text; empty if the previous value was withdrawn.
         author: person or source, such as the EXIF data of a frame; empty for an unnamed person.
         created_at: when it was given.
@@ -102,22 +103,26 @@ def validated_metres(value: float | str) -> str:
     return repr(metres)
 
 
-def validated_facts(
-    name: str | None, captured_at: str | None, note: str | None, metres_per_unit: float | None
-) -> list[tuple[str, str]]:
-    """Validate facts about a scene; return (kind, value) of each. An empty date or 0 metres withdraws a value.
+def validated_facts(edits: SceneEdits) -> list[tuple[str, str]]:
+    """Validate facts about a scene; return (kind, value) of each. An empty value withdraws the previous one.
 
     Raises:
-        InputError: an empty text, control characters, an invalid date or scale.
+        InputError: an empty name or note, control characters, an invalid date or scale.
     """
-    new = [] if name is None else [("name", validated_scene_name(name))]
-    if captured_at is not None:
-        new.append(("captured_at", captured_at and validated_date(captured_at)))
-    if note is not None:
-        new.append(("note", validated_text("a note", note, lines=True)))
-    if metres_per_unit is not None:
-        new.append(("metres_per_unit", validated_metres(metres_per_unit) if metres_per_unit else ""))
-    return new
+    given = {kind: value for kind, value in edits.items() if value is not None}
+    return [(kind, _validated(kind, given[kind])) for kind in SCENE_FACTS if kind in given]
+
+
+def _validated(kind: str, value: Any) -> str:
+    if kind == "name":
+        return validated_scene_name(value)
+    if kind == "note":
+        return validated_text("a note", value, lines=True)
+    if not value:
+        return ""
+    if kind == "captured_at":
+        return validated_date(value)
+    return validated_metres(value) if kind == "metres_per_unit" else validated_text(f"the {kind}", value)
 
 
 def validated_text(what: str, text: str, *, lines: bool = False) -> str:

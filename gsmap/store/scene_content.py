@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any
 
@@ -22,7 +22,10 @@ from gsmap.types import Cameras, Gaussians, GaussianSource, Scene, Thinning
 from gsmap.types.cameras import PhotoLens
 from gsmap.types.gaussians import CHUNK_ROWS as ROWS_AT_ONCE
 from gsmap.types.gaussians import FIELDS
+from gsmap.types.scene import SceneFacts
 from gsmap.types.source import origin_of_source
+
+_FACTS = [field.name for field in fields(SceneFacts)]
 
 LENSES = "cameras.lenses"
 """Name of the array of lenses, which only scenes have whose cameras are not those of their photos."""
@@ -44,16 +47,9 @@ def scene_id(gaussians: GaussianSource, cameras: Cameras) -> str:
 
 def scene_of(row: Row[Any], tags: tuple[str, ...]) -> Scene:
     """Convert a row to a scene."""
+    columns = {name: getattr(row, name) for name in _FACTS}
     return Scene(
-        id=row.id,
-        name=row.name,
-        num_gaussians=row.num_gaussians,
-        sh_degree=row.sh_degree,
-        num_cameras=row.num_cameras,
-        bounds=np.array(row.bounds),
-        scale_policy=row.scale_policy,
-        captured_at=row.captured_at,
-        ingested_at=row.ingested_at,
+        **columns | {"bounds": np.array(row.bounds)},
         source=row.source,
         cameras_synthesised=bool(row.cameras_synthesised),
         antialiased=bool(row.antialiased),

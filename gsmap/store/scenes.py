@@ -6,7 +6,7 @@ import contextlib
 import json
 from collections.abc import Collection, Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 from sqlalchemy import Connection, Row, Text, insert, select, true, type_coerce, update
@@ -38,12 +38,13 @@ from gsmap.store.scene_content import (
     thinning_of,
 )
 from gsmap.store.scene_refs import by_id, find, find_any, find_living, find_removed, name_taken, unused_name
-from gsmap.store.schema import scenes
+from gsmap.store.schema import FACT_COLUMNS, scenes
 from gsmap.stream import bounds as bounds_of
 from gsmap.stream import shift_origin, sorted_along_morton_curve
 from gsmap.types import Cameras, Gaussians, GaussianSource, Scene, Sim3, Thinning
 from gsmap.types.gaussians import FIELDS
 from gsmap.types.progress import Progress
+from gsmap.types.scene import SceneEdits
 from gsmap.types.source import ChunkSource, origin_of_source
 
 KIND = "scenes"
@@ -228,29 +229,23 @@ class Scenes:
         self,
         ref: str,
         *,
-        name: str | None = None,
-        captured_at: str | None = None,
-        note: str | None = None,
         tags_add: Iterable[str] = (),
         tags_remove: Iterable[str] = (),
-        metres_per_unit: float | None = None,
         author: str = "",
+        **edits: Unpack[SceneEdits],
     ) -> Scene:
         """Edit a living scene; earlier values stay in its `facts`.
 
         Args:
-            name: unused among living scenes.
-            captured_at: ISO 8601, default time zone UTC; empty to withdraw the date.
-            note: added to the existing notes.
             tags_add, tags_remove: single words or short phrases.
-            metres_per_unit: metres per unit of its frame; 0 to withdraw it.
             author: of the facts.
+            edits: new values.
 
         Raises:
             NotFoundError: no such scene, it was removed, or it lacks a tag to remove.
             InputError: an empty text, control characters, an invalid date or scale, or a name in use.
         """
-        new = facts.validated_facts(name, captured_at, note, metres_per_unit)
+        new = facts.validated_facts(edits)
         new += [("tag", facts.validated_text("a tag", tag).strip()) for tag in tags_add]
         new += [("untag", facts.validated_text("a tag", tag).strip()) for tag in tags_remove]
         if author:
@@ -258,7 +253,7 @@ class Scenes:
         with self._catalog.write() as connection:
             row = find_living(connection, ref)
             tags = set(facts.current_tags(connection, row.id).get(row.id, ()))
-            same = {("name", row.name), ("captured_at", row.captured_at or ""), *(("tag", tag) for tag in tags)}
+            same = {(kind, getattr(row, kind) or "") for kind in FACT_COLUMNS} | {("tag", tag) for tag in tags}
             same |= {("metres_per_unit", facts.specified_metres(connection).get(row.id, ""))}
             new = [fact for fact in dict.fromkeys(new) if fact not in same]
             for kind, value in new:
@@ -273,7 +268,7 @@ class Scenes:
                         code="tag_not_found",
                     )
             facts.add_facts(connection, row.id, new, author)
-            columns = {kind: value or None for kind, value in new if kind in ("name", "captured_at")}
+            columns = {kind: value or None for kind, value in new if kind in FACT_COLUMNS}
             if columns:
                 connection.execute(update(scenes).where(scenes.c.id == row.id).values(**columns))
             return _with_tags(connection, find(connection, row.id))

@@ -55,6 +55,7 @@ from gsmap.store.matrices import (
 )
 from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
 from gsmap.types.map_object import OBJECT_FACTS
+from gsmap.types.scene import SCENE_FACTS
 from gsmap.types.world import OBSERVATION_KINDS
 
 HEAD = "0014"  # the newest migration; numbered, so that versions can be compared without alembic
@@ -171,7 +172,7 @@ Index(
     sqlite_where=text("removed_at IS NULL"),  # on PostgreSQL too (migrations); naming it here would load that dialect
 )
 
-# Facts about a scene since its ingest, never overwritten. `scenes` holds the newest name and date.
+# Facts about a scene since its ingest, never overwritten. `scenes` holds the newest value of `FACT_COLUMNS`.
 scene_facts = _table(
     "scene_facts",
     Column("number", Integer, primary_key=True),
@@ -180,8 +181,9 @@ scene_facts = _table(
     Column("value", MultilineText, nullable=False),  # empty: a withdrawn date or scale
     Column("author", LineText, nullable=False),
     Column("created_at", Text, nullable=False),
-    CheckConstraint("kind in ('name', 'captured_at', 'note', 'tag', 'untag', 'metres_per_unit')", name="kind"),
+    CheckConstraint(f"kind in {SCENE_FACTS}", name="kind"),
 )
+FACT_COLUMNS = tuple(kind for kind in SCENE_FACTS if kind in scenes.c)
 
 # `chunk_boxes` is an R*Tree on SQLite and a plain table elsewhere, so the migration makes it:
 # id, s0 = s1 = scene number, x0 x1 y0 y1 z0 z1, chunk.

@@ -24,6 +24,7 @@ from gsmap.store.result_rows import GRAPHS
 from gsmap.store.scene_refs import unused_name
 from gsmap.store.scenes import KIND as SCENES
 from gsmap.store.schema import (
+    FACT_COLUMNS,
     groups,
     models,
     observations,
@@ -216,13 +217,13 @@ class Transfer:
             facts.add_facts(self.ours, scene, [("name", row.name)], _MERGE)
 
     def _adopt_later_facts(self, scene: str, mine: Sequence[Content], theirs: Sequence[Content]) -> None:
-        """Update name and date of a scene if the other map has later facts about them.
+        """Update the columns of a scene that facts change, such as its name, if the other map has later facts.
 
         Names and dates from its files at its ingest there are not later facts.
         """
         arrived_at = min(fact["created_at"] for fact in theirs)
         values: Content = {}
-        for kind in ("name", "captured_at"):
+        for kind in FACT_COLUMNS:
             here, there = (
                 [(when, fact) for when, fact in timed(side, _time) if fact["kind"] == kind and fact["author"] != _MERGE]
                 for side in (mine, theirs)

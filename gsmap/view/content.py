@@ -15,6 +15,8 @@ import numpy as np
 from gsmap.geometry.boxes import box_around, box_corners
 from gsmap.geometry.uncertainty import middle_covariance_m2
 from gsmap.types import Scene, ScenePose, Sim3
+from gsmap.types.plain import fields_of, plain
+from gsmap.types.scene import SceneFacts
 
 SCHEMA = 1
 UNPLACED_UP = (0.0, -1.0, 0.0)
@@ -356,11 +358,7 @@ def _scene(
         sigma_m = float(np.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance_m2)[-1]))))
         ellipsoid = (covariance_m2 / metres_per_unit**2).tolist()
     return {
-        "id": scene.id,
-        "name": scene.name,
-        "num_gaussians": scene.num_gaussians,
-        "num_cameras": scene.num_cameras,
-        "captured_at": scene.captured_at,
+        **{name: plain(value) for name, value in fields_of(scene, SceneFacts).items()},
         "component": component,
         "status": "one pair" if entry.one_pair else pose.status if pose is not None else "not placed",
         "S_map_scene": entry.S_map_scene.matrix().tolist(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, get_args
 
+import numpy as np
 import pytest
 
 from gsmap.report import EdgeEntry, Island, Report, SceneEntry, page
@@ -21,10 +22,12 @@ def scene(name: str, status: str = "placed", component: int | None = 0) -> Scene
         name=name,
         id=name,
         num_gaussians=10,
+        sh_degree=0,
+        num_cameras=0,
+        bounds=np.zeros((2, 3)),
         num_nodes=1,
         component=component,
         S_map_scene=None,
-        captured_at=None,
         status=status,
     )
     return SceneEntry(row)

@@ -36,8 +36,8 @@ def made() -> Report:
     scenes = tuple(
         SceneEntry(
             SceneRow(
-                name=name, id=f"{i:032x}", num_gaussians=1000, num_nodes=5, component=0, S_map_scene=None,
-                captured_at="2026-05-04", status=status, note=HOSTILE,
+                f"{i:032x}", name, 1000, 0, 0, np.zeros((2, 3)), captured_at="2026-05-04", num_nodes=5, component=0,
+                S_map_scene=None, status=status, note=HOSTILE,
             ),
             covariance_m2=np.eye(3) * 1e-4 * (i + 1),
         )

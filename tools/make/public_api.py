@@ -85,7 +85,7 @@ def _problems(before: list[str], now: list[str]) -> Iterator[str]:
 def _members(name: str, value: Any) -> Iterator[tuple[str, list[str]]]:
     if inspect.isclass(value):
         made_of = fields(value) if is_dataclass(value) else ()
-        yield name, [f.name if f.default is f.default_factory is MISSING else f"{f.name}=" for f in made_of]
+        yield name, [_parameter(f.name, f.kw_only, f.default is f.default_factory is MISSING) for f in made_of]
         for member in sorted(dir(value)):
             if not member.startswith("_") and member not in {f.name for f in made_of}:
                 yield f"{name}.{member}", _parameters(inspect.getattr_static(value, member))
@@ -99,11 +99,16 @@ def _parameters(value: Any) -> list[str]:
         return []
     out = []
     for one in inspect.signature(function).parameters.values():
-        if one.kind in (one.VAR_KEYWORD, one.VAR_POSITIONAL) or one.name in ("self", "cls"):
-            continue
-        name = one.name if one.default is one.empty else f"{one.name}="
-        out.append(f"*{name}" if one.kind is one.KEYWORD_ONLY else name)
+        if one.kind is one.VAR_KEYWORD and "Unpack[" in str(one.annotation):
+            keywords = getattr(sys.modules[function.__module__], one.annotation.removeprefix("Unpack[")[:-1])
+            out += [_parameter(name, True, False) for name in keywords.__annotations__]
+        elif one.kind not in (one.VAR_KEYWORD, one.VAR_POSITIONAL) and one.name not in ("self", "cls"):
+            out.append(_parameter(one.name, one.kind is one.KEYWORD_ONLY, one.default is one.empty))
     return out
+
+
+def _parameter(name: str, is_keyword: bool, is_required: bool) -> str:
+    return f"{'*' if is_keyword else ''}{name}{'' if is_required else '='}"
 
 
 def _kind(output: Output) -> str:

@@ -51,11 +51,8 @@ def scene_report(
             )
         ),
         origin=scene.source,
-        sh_degree=scene.sh_degree,
-        num_cameras=scene.num_cameras,
         cameras_synthesised=scene.cameras_synthesised,
         antialiased=scene.antialiased,
-        bounds=scene.bounds,
         notes=(*store.scenes.notes(scene.id), *(graph.notes if graph else ()), *([graph_note] if graph_note else ())),
         rotation_sigma_deg=_rotation_sigma_deg(pose) if pose and known else None,
         translation_sigma_m=_translation_sigma(pose) * metre.metres_per_unit if pose and metre and known else None,

@@ -14,7 +14,9 @@ from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
 from gsmap.types import Scene, ScenePose, Sim3
 from gsmap.types.metric_scale import MetricScale
+from gsmap.types.plain import fields_of
 from gsmap.types.rows.scenes import IngestRow, PoseRow, SceneRow
+from gsmap.types.scene import SceneFacts
 
 SCENE_STATUSES = ("ingested", "described", "placed", ONE_PAIR, "tentative", "isolated")
 
@@ -105,17 +107,12 @@ def row_of_scene(
     metre = metres.get(pose.component) if metres and pose else None
     at = (in_world or {}).get(scene.id)
     return SceneRow(
-        name=scene.name,
-        id=scene.id,
-        num_gaussians=scene.num_gaussians,
+        **fields_of(scene, SceneFacts),
         num_nodes=num_nodes,
         component=pose.component if pose else None,
         S_map_scene=pose.S_map_scene if pose else None,
-        captured_at=scene.captured_at,
         status=pose.status if pose else ("ingested" if num_nodes is None else "described"),
-        ingested_at=scene.ingested_at,
         one_pair=one_pair,
-        scale_policy=scene.scale_policy,
         tags=scene.tags,
         note=note,
         metres_per_unit=metre.metres_per_unit if metre and metre.is_known else None,

@@ -10,6 +10,7 @@ import numpy as np
 
 from gsmap.types.pose_graph import Prior
 from gsmap.types.rows.base import Row, coordinates
+from gsmap.types.scene import SceneFacts
 from gsmap.types.sim3 import Sim3
 
 
@@ -53,22 +54,16 @@ class WorldPosition(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SceneRow(WorldPosition):
+class SceneRow(WorldPosition, SceneFacts):
     """A capture in the map.
 
     Args:
-        name: unique among the map's scenes.
-        id: content digest; the same content has the same id in every map.
-        num_gaussians: number of Gaussians.
         num_nodes: number of nodes of its scene graph; null before it is described.
         component: index of its connected component by the newest poses, largest first; null before the first optimize.
         S_map_scene: pose in the frame of its component; null before the first optimize.
-        captured_at: capture date, ISO 8601 with zone; null if unknown.
         status: ``ingested``, ``described``, or by the newest poses ``placed``, ``tentative`` (placed by edges without
             an agreeing cycle) or ``isolated``.
         one_pair: true if it is tentative only because single pairs place it, which nothing contradicts.
-        ingested_at: time of the ingest, ISO 8601 with zone.
-        scale_policy: ``known`` (its unit is the metre), ``unknown`` or ``auto``.
         tags: tags.
         note: newest note.
         metres_per_unit: metres per unit of its component's frame, see ``gsmap status``; null if unknown.
@@ -89,17 +84,11 @@ class SceneRow(WorldPosition):
         "in_world": "world",
     }
 
-    name: str
-    id: str
-    num_gaussians: int
     num_nodes: int | None
     component: int | None
     S_map_scene: Sim3 | None
-    captured_at: str | None
     status: str
     one_pair: bool = False
-    ingested_at: str | None = None
-    scale_policy: str = "auto"
     tags: tuple[str, ...] = ()
     note: str = ""
     metres_per_unit: float | None = None
@@ -240,11 +229,8 @@ class SceneReport(SceneRow):
 
     Args:
         origin: path it was read from.
-        sh_degree: degree of its spherical harmonics.
-        num_cameras: number of cameras.
         cameras_synthesised: true if gsmap synthesized the cameras because the capture had none.
         antialiased: true if it was trained with the 2D Mip filter.
-        bounds: (2, 3) lowest and highest corner of the Gaussians' centres, scene frame.
         notes: remarks on how it was read and described.
         rotation_sigma_deg: largest standard deviation of its rotation; null if unknown.
         translation_sigma_m: largest standard deviation of its translation; null if unknown.
@@ -265,11 +251,8 @@ class SceneReport(SceneRow):
     columns: ClassVar[Mapping[str, str]] = SceneRow.columns
 
     origin: str
-    sh_degree: int
-    num_cameras: int
     cameras_synthesised: bool
     antialiased: bool
-    bounds: np.ndarray
     notes: tuple[str, ...] = ()
     rotation_sigma_deg: float | None = None
     translation_sigma_m: float | None = None
@@ -357,7 +340,7 @@ class GraphRow(SceneRef):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PoseRow(SceneRef, WorldPosition):
+class PoseRow(WorldPosition, SceneRef):
     """The pose of a scene.
 
     Args:
