@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from gsmap.geometry.rotations import angle_between, matrices_to_quats, multiply_quats
 from gsmap.localize import feature_frames, matching, resection
+from gsmap.localize.distances import relative_distance
 from gsmap.localize.map_scene import MapScene
 
 MAX_TURN_DEG = 30.0
@@ -23,7 +25,8 @@ MAX_ORIENTATIONS = 10
 """Number of clusters of orientations from which poses are estimated, the largest clusters first."""
 
 DUPLICATE_M, DUPLICATE_DEG = 0.4, 12.0
-"""Two poses that are nearer to each other would be refined to the same pose."""
+"""Two poses that are nearer to each other would be refined to the same pose; in metres at distances of a room
+(`gsmap.localize.distances`)."""
 
 _MAX_SEEDS = 1000  # number of matches around which clusters of orientations are grown
 _SAME_CLUSTER = 1 / 3  # of MAX_TURN_DEG: nearer orientations lead to the same cluster
@@ -49,6 +52,11 @@ class PoseCandidate:
     scenes: tuple[str, ...]
     pixels: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @cached_property
+    def scale(self) -> float:
+        """Distance of the matched points relative to the distances of a room (`gsmap.localize.distances`)."""
+        return relative_distance(np.linalg.norm(self.points - self.T_metric_camera[:3, 3], axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +221,7 @@ def is_duplicate(one: PoseCandidate, other: PoseCandidate) -> bool:
         return False
     far = np.linalg.norm(one.T_metric_camera[:3, 3] - other.T_metric_camera[:3, 3])
     angle = angle_between(one.T_metric_camera[:3, :3], other.T_metric_camera[:3, :3])
-    return bool(far < DUPLICATE_M and np.degrees(angle) < DUPLICATE_DEG)
+    return bool(far < DUPLICATE_M * min(one.scale, other.scale) and np.degrees(angle) < DUPLICATE_DEG)
 
 
 def _scenes_by_inliers(matches: PointMatches, inliers: np.ndarray) -> tuple[str, ...]:

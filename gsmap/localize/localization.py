@@ -37,10 +37,10 @@ HIGH_PROBABILITY = 0.97
 RIVAL_INLIERS = 0.5
 
 MIN_COMPARED_PROBABILITY = 0.05
-"""A pose whose best possible probability is lower is not compared for mismatches."""
+"""A pose whose best possible probability is lower is not refined once more or compared for mismatches."""
 
 _SKIP_PROBABILITY = 0.5  # candidates whose matches agree with a pose of at least this probability are skipped
-_OTHER_PLACE_M = 0.5  # smallest distance between poses at different places
+_OTHER_PLACE_M = 0.5  # smallest distance between poses at different places, at distances of a room
 _OCCLUSION = 1.05  # largest ratio of a visible Gaussian's depth to the rendered depth
 
 
@@ -256,12 +256,19 @@ def evaluate_pose(
         aliased_prior: see `gsmap.localize.verdict.Params`.
     """
     of_candidate = [scenes[scene] for scene in candidate.scenes]
-    refined = refine_pose(photo, candidate.T_metric_camera, candidate.intrinsics_px, of_candidate)
     model = probability.load_model()
-    known = refined.covariance
-    pieces = probability.refinement_evidence(photo, refined, max_sigmas(known), candidate.num_inliers)
-    hopeless = model.probability(pieces, aliased_prior, optimistic=True) < MIN_COMPARED_PROBABILITY
-    mismatches = mismatch.mismatch_map(photo.rgb, [] if hopeless else refined.renders, photo.mask)
+
+    def evidence_of(refined: RefinedPose) -> dict[str, float]:
+        return probability.refinement_evidence(photo, refined, max_sigmas(refined.covariance), candidate.num_inliers)
+
+    def is_hopeless(refined: RefinedPose) -> bool:
+        best_case = model.probability(evidence_of(refined), aliased_prior, optimistic=True)
+        return best_case < MIN_COMPARED_PROBABILITY
+
+    start = candidate.T_metric_camera, candidate.intrinsics_px
+    refined = refine_pose(photo, *start, of_candidate, is_hopeless)
+    known, pieces = refined.covariance, evidence_of(refined)
+    mismatches = mismatch.mismatch_map(photo.rgb, [] if is_hopeless(refined) else refined.renders, photo.mask)
     comparison = evidence.compare(photo.rgb, refined.renders, mismatches, mask=photo.mask)
     coarse = evidence.compare_coarsely(photo.rgb, refined.renders, mismatches, photo.mask)
     pieces |= probability.render_evidence(comparison, coarse, mismatches)
@@ -283,7 +290,7 @@ def rival_probability(poses: Sequence[EvaluatedPose]) -> float:
     best = poses[0]
     for other in poses[1:]:
         far = np.linalg.norm(best.refined.T_metric_camera[:3, 3] - other.refined.T_metric_camera[:3, 3])
-        if other.candidate.component != best.candidate.component or far > _OTHER_PLACE_M:
+        if other.candidate.component != best.candidate.component or far > _OTHER_PLACE_M * best.refined.scale:
             return other.probability
     return 0.0
 

@@ -20,6 +20,7 @@ from scipy.ndimage import binary_dilation, label
 from gsmap.compare.colours import balance
 from gsmap.geometry.filters import blur, box_means
 from gsmap.localize.candidate_renders import GREY, SceneRender, downsample, downsample_mask
+from gsmap.localize.distances import relative_distance
 
 MISMATCH_PROBABILITY = 0.5
 """A cell with at least this probability counts as a mismatch."""
@@ -148,6 +149,7 @@ def cell_features(half: np.ndarray, one: SceneRender, mask: np.ndarray | None = 
         valid &= mask
     a, b = half @ GREY, rendered @ GREY
     hue, light, spreads = _colour_differences(half, rendered, valid)
+    depth = downsample(one.depth_m, 2)[::STEP, ::STEP]
     fine = [(x - blur(x, 1.0)) ** 2 for x in (a, b)]
     patterns = [a, b, a * a, b * b, a * b]
     planes = [valid, downsample(one.smooth, 2), hue, light, np.abs(light), *fine]
@@ -165,7 +167,7 @@ def cell_features(half: np.ndarray, one: SceneRender, mask: np.ndarray | None = 
         share,
         smooth,
         *(_log(np.sqrt(x)) for x in (fine_a, fine_b)),
-        np.log(np.clip(downsample(one.depth_m, 2)[::STEP, ::STEP], 0.1, 20)),
+        np.log(np.clip(depth / relative_distance(depth), 0.1, 20)),
         *(_log(np.full_like(share, spread)) for spread in spreads),
     ]
     valid_cells = share > _MIN_VALID

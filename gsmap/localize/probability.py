@@ -86,7 +86,7 @@ def refinement_evidence(
         "found_again": count / refined.num_tracked if refined.num_tracked else 0.0,
         "laid": refined.agreement,
         "spread": block_coverage(refined.pixels[inliers], photo.size_px),
-        "sigma_m": float(np.log10(np.clip(sigmas[1], 1e-4, 10.0))),
+        "sigma_m": float(np.log10(np.clip(sigmas[1] / refined.scale, 1e-4, 10.0))),
     }
 
 

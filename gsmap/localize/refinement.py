@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from gsmap.geometry.projection import project
 from gsmap.localize import covariance, direct_alignment, resection, tracking
 from gsmap.localize.candidate_renders import GREY, SceneRender, downsample, downsample_mask, render_scenes, sample_mask
+from gsmap.localize.distances import relative_distance
 from gsmap.localize.map_scene import MapScene
 
 MAX_SCENES = 3
@@ -30,6 +32,7 @@ REPEAT_BELOW_AGREEMENT = 0.5
 MAX_INLIER_PX = 2.0
 """Largest distance between an inlier patch and its prediction, for a photo of 480 pixels."""
 
+_SCALE_STRIDE_PX = 8  # spacing of the rows and columns whose depths are averaged
 _MAX_MOTION_PX = 0.5  # scenes are rendered again if their content moves farther than this ...
 _SAME_PX = 1e-3  # smaller motions are rounding errors
 _MAX_MOTION_BLURS = 0.5  # ... or, for direct alignment, farther than this many blurs
@@ -92,6 +95,12 @@ class RefinedPose:
     agreement: float
     renders: Sequence[SceneRender]
 
+    @cached_property
+    def scale(self) -> float:
+        """Distance of the rendered content relative to the distances of a room (`gsmap.localize.distances`)."""
+        depths = [one.depth_m[::_SCALE_STRIDE_PX, ::_SCALE_STRIDE_PX].ravel() for one in self.renders]
+        return relative_distance(np.concatenate([np.zeros(0), *depths]))
+
     def inliers(self, size_px: tuple[int, int]) -> np.ndarray:
         """Return a (K,) mask of patches within `MAX_INLIER_PX` of their prediction."""
         if self.fit is None:
@@ -101,7 +110,11 @@ class RefinedPose:
 
 
 def refine_pose(
-    photo: ScaledPhoto, T_metric_camera: np.ndarray, intrinsics_px: np.ndarray, scenes: Sequence[MapScene]
+    photo: ScaledPhoto,
+    T_metric_camera: np.ndarray,
+    intrinsics_px: np.ndarray,
+    scenes: Sequence[MapScene],
+    is_hopeless: Callable[[RefinedPose], bool] = lambda refined: False,
 ) -> RefinedPose:
     """Track patches within a large radius, align renders directly, track patches again, and fuse both estimates.
 
@@ -111,10 +124,11 @@ def refine_pose(
     Args:
         intrinsics_px: (4,) intrinsics at the photo's size, as far as known.
         scenes: scenes that may show the place, sorted by their number of matches.
+        is_hopeless: return whether a pose will be rejected, so that it is not refined once more.
     """
     scenes = scenes[:MAX_SCENES]
     found = _refine_once(photo, T_metric_camera, intrinsics_px, scenes)
-    if found.fit is not None and found.agreement < REPEAT_BELOW_AGREEMENT:
+    if found.fit is not None and found.agreement < REPEAT_BELOW_AGREEMENT and not is_hopeless(found):
         again = _refine_once(photo, found.T_metric_camera, found.intrinsics_px, scenes, found.renders)
         found = again if again.agreement > found.agreement else found
     if not found.renders:
