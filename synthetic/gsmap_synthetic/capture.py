@@ -156,6 +156,7 @@ def film(
     gain: float | np.ndarray = 1.0,
     gamma: float = 1.0,
     focal: float = _FOCAL,
+    sky: Callable[[np.ndarray], np.ndarray] | None = None,
     name: str = "frame",
     progress: Callable[[float, str], None] | None = None,
 ) -> Frames:
@@ -163,7 +164,8 @@ def film(
 
     ``shut`` names the doors (indices) that are closed meanwhile. ``gain`` (one, or one a channel: white balance) and
     ``gamma`` imitate a camera's exposure: colours become ``clip(gain * colour ** gamma)``. ``focal`` is the focal
-    length as a share of the image's width.
+    length as a share of the image's width. ``sky`` gives the colours (n, 3) of directions (n, 3) in which there is
+    nothing, which are black by default.
     """
     width, height = size_px
     focal *= width
@@ -179,7 +181,7 @@ def film(
     skin = place.skin.with_shut(shut)
     fine, centre = _pixel_rays(size_px, focal, 2), _pixel_rays(size_px, focal, 1)
     for i, pose in enumerate(poses):
-        colour = _look(skin, pose, fine, 0.5 / focal).reshape(height, 2, width, 2, 3)
+        colour = _look(skin, pose, fine, 0.5 / focal, sky).reshape(height, 2, width, 2, 3)
         colour = 0.25 * (colour[:, 0, :, 0] + colour[:, 0, :, 1] + colour[:, 1, :, 0] + colour[:, 1, :, 1])
         images[i] = np.round(255 * np.clip(gain * colour**gamma, 0, 1))
         distance, *_ = skin.cast(*_placed(centre, pose))
@@ -207,9 +209,17 @@ def _placed(rays: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape), directions
 
 
-def _look(skin: Skin, pose: np.ndarray, rays: np.ndarray, pixel: float) -> np.ndarray:
-    """(n, 3) colours seen along camera-frame rays of unit depth; black where there is nothing."""
-    distance, quad, s, t = skin.cast(*_placed(rays, pose))
+def _look(
+    skin: Skin, pose: np.ndarray, rays: np.ndarray, pixel: float, sky: Callable[[np.ndarray], np.ndarray] | None
+) -> np.ndarray:
+    """(n, 3) colours seen along camera-frame rays of unit depth; the sky's, or black, where there is nothing."""
+    origins, directions = _placed(rays, pose)
+    distance, quad, s, t = skin.cast(origins, directions)
     hit = np.isfinite(distance)
     colours = skin.colour(quad, s, t, pixel * np.where(hit, distance, 1))
-    return colours if hit.all() else colours * hit[:, None]
+    if hit.all():
+        return colours
+    colours = colours * hit[:, None]
+    if sky is not None:
+        colours[~hit] = sky(directions[~hit])
+    return colours

@@ -282,6 +282,24 @@ def court_captures(
     )
 
 
+def cloudy(seed: int) -> Callable[[np.ndarray], np.ndarray]:
+    """The colours (n, 3) of a sky of a seed by direction (n, 3): blue to white, with clouds."""
+    rng = np.random.default_rng([seed, 35])
+    top, cover = np.array([0.3, 0.5, 0.85]) * rng.uniform(0.7, 1.1), rng.uniform(-0.2, 0.4)
+
+    def look(directions: np.ndarray) -> np.ndarray:
+        x, y, z = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
+        u, v = x / (z.clip(0) + 0.2), y / (z.clip(0) + 0.2)
+        cloud = np.zeros(len(z))
+        for k in range(3):
+            cloud += 0.5**k * (tx.noise(u, v, 0.8 / 2**k, seed + k) - 0.5)
+        white = np.clip(0.4 * (1 - z.clip(0)) + 1.2 * (cloud + cover), 0, 1)[:, None]
+        out: np.ndarray = ((1 - white) * top + white * 0.95).astype(np.float32)
+        return out
+
+    return look
+
+
 def walks(place: Place, captures: int) -> list[float]:
     """Middles of walks along a court, in random order: neighbours share from most to little of what they see."""
     rng = np.random.default_rng([place.seed, 34])

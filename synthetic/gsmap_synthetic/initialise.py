@@ -53,6 +53,30 @@ def from_depth(frames: Frames, count: int, seed: int = 0) -> Gaussians:
     )
 
 
+def from_features(frames: Frames, count: int, seed: int = 0) -> Gaussians:
+    """``count`` round Gaussians where the picture has most contrast, as a trainer starts from the triangulated features
+    of a few photographs: blank surfaces and the sky have none.
+
+    Raises:
+        InputError: frames without depth, or with almost none.
+    """
+    from scipy.spatial import cKDTree
+
+    points, colours, _, detail = _back_project(frames)
+    if len(points) < 100:
+        raise InputError(f"only {len(points)} pixels have a usable depth: check the depth's unit and the poses")
+    rng = np.random.default_rng([seed, 9])
+    weight = np.maximum(detail - np.quantile(detail, 0.6), 0)
+    chosen = rng.choice(len(points), count, replace=False, p=weight / weight.sum())
+    apart = cKDTree(points[chosen]).query(points[chosen], k=4)[0][:, 1:].mean(1)
+    reach = 0.7 * np.clip(apart, *np.quantile(apart, [0.05, 0.95]))
+    n = len(chosen)
+    sh = sh0_of_rgb(colours[chosen])[:, None, :]
+    return Gaussians(
+        points[chosen], np.tile([1.0, 0, 0, 0], (n, 1)), np.log(np.tile(reach[:, None], 3)), np.zeros(n), sh
+    )
+
+
 def from_colour(frames: Frames, count: int, near: float, far: float, seed: int = 0) -> Gaussians:
     """``count`` Gaussians at random depths along random pixels' rays, for frames without depth (units of the poses)."""
     rng = np.random.default_rng([seed, 6])

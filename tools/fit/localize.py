@@ -822,7 +822,9 @@ def main() -> int:
         fit_cells(places_and_streets(args.places, "fit", args.cache, params), params)
         return 0
     if args.what == "placed":
-        place_all(places(args.places, "test", args.cache, params), params)
+        for kind in ("test", "test_courts"):
+            print(kind)
+            place_all(places(args.places, kind, args.cache, params), params)
         return 0
     split = "fit" if args.what == "verdict" else "test"
     kept = args.cache / f"judged-{split}.pickle"

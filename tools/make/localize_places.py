@@ -11,6 +11,9 @@ Beside them, in OUT/fit_streets and OUT/test_streets, streets whose decorations 
 furniture standing elsewhere (`gsmap_synthetic.streets`): captures are of the first room of each decoration, and so are
 some photographs; the others are of later rooms, which look alike and are not in the map. Of those ``differs`` says what
 share of the pixels differs (by more than a tenth of the range) from the same photograph taken in the room of the map.
+
+In OUT/fit_courts and OUT/test_courts, courts under a sky (`gsmap_synthetic.court`), with captures of 20 to 45
+photographs each that are trained from sparse points, as those of a person with a camera are.
 """
 
 from __future__ import annotations
@@ -30,16 +33,22 @@ import gsmap_synthetic as synthetic
 from gsmap.errors import ConfigError
 from gsmap_synthetic import perturb
 from gsmap_synthetic.capture import default_routes, look_along, unused_doors
+from gsmap_synthetic.court import cloudy, make_court, stroll
 from gsmap_synthetic.edits import edit_place
+from gsmap_synthetic.initialise import from_features
 from gsmap_synthetic.make import fit_frames, put_in_own_frame
 from gsmap_synthetic.place import Place
 from gsmap_synthetic.script import random_edits
 from gsmap_synthetic.streets import make_street, street_routes
+from gsmap_synthetic.train import Params as TrainParams
+from gsmap_synthetic.train import train
 from tools.harness import argument_parser
 
 SETS = {"fit": range(50_000, 50_012), "test": range(60_000, 60_006)}
 STREETS = {"fit": range(50_100, 50_108), "test": range(60_100, 60_104)}
+COURTS = {"fit": range(50_200, 50_206), "test": range(60_200, 60_204)}
 CAPTURE_PX, PHOTO_PX = (400, 300), (480, 360)
+SPARSE_POINTS, SPARSE_TRAINING = 8000, TrainParams(steps=400, splits=5, split_share=0.4)  # of captures of courts
 PHOTOS = 24
 DECORATIONS, TIMES = 3, 4  # of a street, and how often each comes
 PHOTOS_OF_MAP, PHOTOS_ALIKE = 24, 36
@@ -58,7 +67,49 @@ def main() -> int:
     for seed in STREETS[args.set]:
         if args.only in (None, seed):
             make_alike(args.out / f"{args.set}_streets" / str(seed), seed)
+    for seed in COURTS[args.set]:
+        if args.only in (None, seed):
+            make_outdoors(args.out / f"{args.set}_courts" / str(seed), seed)
     return 0
+
+
+def make_outdoors(folder: Path, seed: int) -> None:
+    """A court, two captures of a part of it from few photographs, and photographs from elsewhere in that part."""
+    if (folder / "done").exists():
+        return
+    began = time.process_time()
+    rng = np.random.default_rng([seed, 31])
+    place, sky = make_court(seed), cloudy(seed)
+    middle, apart = rng.uniform(16.0, 48.0), rng.uniform(1.0, 6.0)
+    for k in range(2):
+        count = int(rng.integers(20, 46))
+        poses = stroll(place, middle + (k - 0.5) * apart, count, k)
+        light = {"gain": rng.uniform(0.8, 1.15), "gamma": rng.uniform(0.9, 1.15)}
+        frames = synthetic.film(place, poses, size_px=PHOTO_PX, sky=sky, name=f"c{k}", **light)
+        gaussians = train(from_features(frames, SPARSE_POINTS, seed=k), frames, SPARSE_TRAINING, seed=k)
+        capture = put_in_own_frame(gaussians, frames, f"c{k}", np.random.default_rng([seed, k, 8]))
+        synthetic.write_captures(folder, [capture])
+    (folder / "photos").mkdir(exist_ok=True)
+    told = []
+    for i in range(PHOTOS):
+        pose = stroll(place, middle + rng.uniform(-4, 4), 200, 100 + i)[int(rng.integers(200))]
+        pose[:2, 3] += rng.normal(size=2)
+        focal, gain, gamma = rng.uniform(0.55, 0.95), rng.uniform(0.7, 1.3), rng.uniform(0.85, 1.2)
+        shot = synthetic.film(place, pose[None], size_px=PHOTO_PX, gain=gain, gamma=gamma, focal=focal, sky=sky)
+        Image.fromarray(shot.images[0]).save(folder / "photos" / f"p{i:03d}.jpg", quality=88)
+        told.append(
+            {
+                "file": f"p{i:03d}.jpg",
+                "T_world_camera": pose.tolist(),
+                "intrinsics": shot.cameras.intrinsics_px[0].tolist(),
+                "gain": gain,
+                "changed": False,
+                "occluded": 0.0,
+            }
+        )
+    (folder / "photos.json").write_text(json.dumps(told))
+    (folder / "done").touch()
+    print(f"{seed}: a court, {time.process_time() - began:.0f} CPU s", flush=True)
 
 
 def make(folder: Path, seed: int) -> None:
