@@ -10,7 +10,9 @@ small random motions. The photo is one of the frames that c0 was trained on. ``-
 captures NAME.ply, NAME.cameras.json and, optionally, truth/NAME.json (``T_scene_world``) and one photo.jpg.
 
 One line for each step: CPU seconds (user and system, one thread) and peak memory, each step in a process of its own,
-without imports. "pair" is the first registration of two described scenes by a process, "pair again" the second.
+without imports. "pair" is the first registration of two described scenes by a process, "pair again" the second. "tto
+tile" is one tile of 6 m at the middle of the first capture, optimized in 150 steps: of both captures as if they had no
+dates, and where they disagree of the newest. "tiles with levels" exports the union of both as 3D Tiles.
 """
 
 # Thread counts must be set before numpy comes in.
@@ -27,7 +29,9 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "GSMAP_WORKERS"):
 import json
 import multiprocessing
 import shutil
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -40,11 +44,12 @@ from gsmap.formats import cameras_json
 from gsmap.geometry.rotations import exp_so3, quats_to_matrices
 from gsmap.types import Cameras, Gaussians, Sim3
 
-STEPS = ("ingest", "describe", "pair", "pair again", "changes", "features", "photo")
+STEPS = ("ingest", "describe", "pair", "pair again", "changes", "features", "photo", "tto tile", "tiles with levels")
 _NUM_CAMERAS = 300
 _SH_REST_SIGMA = 0.03
 _CAMERA_SIGMAS = 0.05, 0.05  # metres, radians
 _FOCAL_PX = 280.0  # of the frames of the house
+_TILE_M, _TILE_STEPS = 6.0, 150  # edge and optimization steps of the tile of the step "tto tile"
 
 
 def densified(gaussians: Gaussians, count: int, seed: int) -> Gaussians:
@@ -121,14 +126,43 @@ def _photo(path: str, folder: Path, part: int) -> str:
     return report.results[0].status
 
 
+def _tto_tile(path: str, folder: Path, part: int) -> str:
+    with gsmap.map.open(path) as m:
+        first, _ = m.scenes()
+        middle = m.poses()[first.name].S_map_scene.apply(first.bounds.mean(0))
+        half = np.array([_TILE_M / 2, _TILE_M / 2, 1e3])
+        box = [*(middle - half), *(middle + half)]
+        prefer = ("both", "newest")[part]
+        with _empty_folder() as out:
+            report = m.export(out, format="ply", merge="tto", tile_size_m=0, bbox=box, steps=_TILE_STEPS, prefer=prefer)
+    return f"{sum(tile.num_gaussians for tile in report.tiles)} Gaussians"
+
+
+def _tiles_with_levels(path: str, folder: Path, part: int) -> str:
+    with gsmap.map.open(path) as m, _empty_folder() as out:
+        report = m.export(out, format="3dtiles", merge="union")
+        num_levels = len(list(out.glob("component_*/levels/*")))
+    return f"{len(report.tiles)} tiles, {num_levels} levels"
+
+
+@contextmanager
+def _empty_folder() -> Iterator[Path]:
+    """Yield an empty folder for an export, whose merged tiles no cache holds."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["GSMAP_CACHE"] = folder + "/cache"
+        yield Path(folder, "out")
+
+
 def _imports() -> None:
     """Import what the steps use, which is not part of their cost."""
     import gsmap.change
     import gsmap.describe
+    import gsmap.export
     import gsmap.localize
     import gsmap.map.changes
     import gsmap.map.photo_localization
     import gsmap.map.stages.change
+    import gsmap.map.stages.export
     import gsmap.map.stages.ingest
     import gsmap.map.stages.localize
     import gsmap.map.stages.register
@@ -188,6 +222,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.data is None and options.house is None:
         parser.error("give --data or --house")
+    if options.profile:
+        options.profile.mkdir(parents=True, exist_ok=True)
     rows: list[tuple[object, ...]] = []
     folders = [(options.data.name, options.data)] if options.data else []
     for millions in [] if options.data else options.millions:
@@ -230,7 +266,7 @@ def run(path: str, folder: Path, steps: list[str], profile: Path | None) -> list
         say(f"{folder.name}: {pose_error(path, folder)}")
     if "pair again" in steps:
         add("pair again", measure(_pair, times=2))
-    if {"changes", "features", "photo"} & set(steps):
+    if {"changes", "features", "photo", "tto tile", "tiles with levels"} & set(steps):
         with gsmap.map.open(path) as m:
             m.optimize()
     if "changes" in steps:
@@ -239,6 +275,11 @@ def run(path: str, folder: Path, steps: list[str], profile: Path | None) -> list
         add("features of both captures", measure(_features))
     if "photo" in steps and (folder / "photo.jpg").exists():
         add("a photo, features known", measure(_photo, times=2))
+    if "tto tile" in steps:
+        add("tto tile of both captures", measure(_tto_tile))
+        add("tto tile of the newest", measure(_tto_tile, 1))
+    if "tiles with levels" in steps:
+        add("tiles with levels", measure(_tiles_with_levels))
     return rows
 
 
