@@ -42,7 +42,7 @@ class ReferenceView:
 
     Args:
         box: (2, 3) lowest and highest corner of the visible surface.
-        keys: (K,) uint64 sorted keys of the visible Gaussians, from `keys_of`.
+        keys: (K,) uint64 sorted distinct keys of the visible Gaussians, from `keys_of`.
         pixels: (K,) int32 number of pixels that each visible Gaussian dominates.
         largest: (K,) float32 largest blending weight of each visible Gaussian.
         depth: (H, W) float32 expected z of the surface, 0 without a surface.
@@ -54,7 +54,7 @@ class ReferenceView:
     largest: np.ndarray
     depth: np.ndarray
 
-    @property
+    @cached_property
     def num_bytes(self) -> int:
         return sum(array.nbytes for array in self._arrays())
 
@@ -197,7 +197,7 @@ class SceneReferenceViews:
     store: ReferenceViewCache
 
     @cached_property
-    def _nearby(self) -> RegionCache[tuple[Gaussians, ChunkIndex, np.ndarray]]:
+    def _nearby(self) -> RegionCache[tuple[Gaussians, ChunkIndex, np.ndarray, np.ndarray]]:
         return RegionCache(self._with_keys, self.around)
 
     def of(self, camera: int) -> ReferenceView:
@@ -210,23 +210,27 @@ class SceneReferenceViews:
         return self._nearby.cell(self.cameras.centers[camera])
 
     def _seen(self, camera: int) -> ReferenceView:
-        gaussians, index, keys = self._nearby.of(self.cameras.centers[camera])
+        gaussians, index, keys, order = self._nearby.of(self.cameras.centers[camera])
         view = self.cameras[camera].resized(self.longest_side_px)
         seen = render(gaussians, view, max_weight=True, index=index)
         dominant = seen.dominant_id[0]
         pixels = np.bincount(dominant[dominant >= 0], minlength=len(gaussians))
-        rows = np.flatnonzero(seen.max_weight > 0)
-        rows = rows[np.argsort(keys[rows], kind="stable")]
+        shown = (seen.max_weight > 0)[order]
+        rows, keys = order[shown], keys[shown]
+        if len(keys):
+            first = np.append(True, keys[1:] != keys[:-1])  # of Gaussians with equal means
+            rows, keys = rows[first], keys[first]
         depth = np.ascontiguousarray(seen.depth[0])
-        return ReferenceView(
-            _box_of(view, depth), keys[rows], pixels[rows].astype(np.int32), seen.max_weight[rows], depth
-        )
+        return ReferenceView(_box_of(view, depth), keys, pixels[rows].astype(np.int32), seen.max_weight[rows], depth)
 
-    def _with_keys(self, box: np.ndarray) -> tuple[Gaussians, ChunkIndex, np.ndarray]:
-        """Return the Gaussians in a box without view-dependent colour, which views do not keep, and their keys."""
+    def _with_keys(self, box: np.ndarray) -> tuple[Gaussians, ChunkIndex, np.ndarray, np.ndarray]:
+        """Return the Gaussians in a box without view-dependent colour, which views do not keep, their index, their
+        sorted keys, and the permutation that sorts them."""
         found = self.load(box)
         found = found.degree_0(inside(found.means, box))
-        return found, ChunkIndex.build(found), keys_of(found.means)
+        keys = keys_of(found.means)
+        order = np.argsort(keys, kind="stable")
+        return found, ChunkIndex.build(found), keys[order], order
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,15 +241,15 @@ class PlacedReferenceViews:
         views: reference views of the scene.
         S_map_scene: pose of the scene.
         rows: (C,) index in the scene of each placed camera.
-        keys: (N,) uint64 keys of the placed Gaussians.
-        order: (N,) permutation that sorts the keys.
+        keys: (K,) uint64 sorted distinct keys of the placed Gaussians.
+        key_of: (N,) index of the key of each placed Gaussian.
     """
 
     views: SceneReferenceViews
     S_map_scene: Sim3
     rows: np.ndarray
     keys: np.ndarray
-    order: np.ndarray
+    key_of: np.ndarray
 
     def of(self, camera: int) -> ReferenceView:
         """Return the view of a placed camera, in the frame of the scene."""
@@ -270,15 +274,14 @@ class PlacedReferenceViews:
         return bool((low <= bounds[1] + margin).all() and (high >= bounds[0] - margin).all())
 
     def count(self, view: ReferenceView, pixels: np.ndarray, largest: np.ndarray) -> None:
-        """Add the pixels and the largest weights of the placed Gaussians in a view to the (N,) arrays."""
-        if not len(view.keys):
+        """Add the pixels and the largest weights of the placed Gaussians in a view to the (K,) arrays by key."""
+        if not len(self.keys):
             return
-        # The queries are sorted, because random access takes several times as long.
-        at = np.minimum(np.searchsorted(view.keys, self.keys[self.order]), len(view.keys) - 1)
-        known = view.keys[at] == self.keys[self.order]
-        rows, at = self.order[known], at[known]
-        pixels[rows] += view.pixels[at]
-        largest[rows] = np.maximum(largest[rows], view.largest[at])
+        at = np.minimum(np.searchsorted(self.keys, view.keys), len(self.keys) - 1)
+        known = self.keys[at] == view.keys
+        at = at[known]
+        pixels[at] += view.pixels[known]
+        largest[at] = np.maximum(largest[at], view.largest[known])
 
 
 def keys_of(means: np.ndarray) -> np.ndarray:

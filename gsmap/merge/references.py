@@ -113,14 +113,19 @@ def render_references(
     ]
     todo = _best_views(todo, scenes, pieces, max_views)
     cameras, images, weights, kept, shares, places = [], [], [], [], [], []
-    pixels, sure = ([np.zeros(len(scene.gaussians), dtype=np.int64) for scene in scenes] for _ in range(2))
-    largest = [np.zeros(len(scene.gaussians), dtype=np.float32) for scene in scenes]
     reference_views = [
         scene.reference_views(longest_side_px)
         if scene.reference_views is not None and (settled is None or not settled.is_disputed(i))
         else None
         for i, scene in enumerate(scenes)
     ]
+    # Per Gaussian, or per key of the shared views.
+    counted = [
+        len(scene.gaussians if shared is None else shared.keys)
+        for scene, shared in zip(scenes, reference_views, strict=True)
+    ]
+    pixels, sure = ([np.zeros(count, dtype=np.int64) for count in counted] for _ in range(2))
+    largest = [np.zeros(count, dtype=np.float32) for count in counted]
     todo.sort(
         key=lambda one: (one[0], () if (shared := reference_views[one[0]]) is None else shared.cell(one[1]), one[1])
     )
@@ -207,7 +212,9 @@ def render_references(
         scene=np.array(kept, dtype=np.int64),
         view_weights=often,
         visible_pixels=[
-            _visible_pixels(np.where(s > 0, p, 0) if shared is None else p, w, whole=bounds is None)
+            _visible_pixels(np.where(s > 0, p, 0), w, whole=bounds is None)
+            if shared is None
+            else _visible_pixels(p, w, whole=bounds is None)[shared.key_of]
             for p, s, w, shared in zip(pixels, sure, largest, reference_views, strict=True)
         ],
         num_photos=len(kept) - num_rendered,

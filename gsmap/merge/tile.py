@@ -155,7 +155,7 @@ def _reference_views(
     reference_views = SceneReferenceViews(
         scene.scene_id + scene.without, scene.load, scene.cameras, around, longest_side_px, scene.store
     )
-    return PlacedReferenceViews(reference_views, scene.S_map_scene, rows, keys, np.argsort(keys, kind="stable"))
+    return PlacedReferenceViews(reference_views, scene.S_map_scene, rows, *np.unique(keys, return_inverse=True))
 
 
 def _with_cameras(box: np.ndarray, centers: np.ndarray, count: int) -> np.ndarray:
