@@ -17,7 +17,7 @@ import numpy as np
 from gsmap.errors import ConfigError
 from gsmap.formats import tiles3d
 from gsmap.geometry.projection import in_image, project
-from gsmap.render import render
+from gsmap.render import ChunkIndex, render
 from gsmap.render.fit import make_fitter, with_enough_memory
 from gsmap.render.fitter import FitOptions, LearningRates
 from gsmap.types import Cameras, Gaussians
@@ -95,16 +95,20 @@ def make_level(
     kept = np.arange(len(views)) % 4 == 3
     depths = _depths(start, views)  # same depths as the finer level, at a fraction of the cost
     footprint = float(np.exp(np.median(start.log_scales.max(1)))) / deviation_px
-    fitted = with_enough_memory(
-        lambda backend: _fit(start, finer, views[~kept], depths[~kept], footprint, params, backend)
-    )
+    index = ChunkIndex.build(finer)
+
+    def measured_views(rows: np.ndarray, footprint: float) -> list[_MeasuredView]:
+        return [
+            _MeasuredView(camera, _render(finer, camera, index))
+            for camera in _resized_views(views[rows], depths[rows], footprint)
+        ]
+
+    targets = measured_views(~kept, footprint)
+    fitted = with_enough_memory(lambda backend: _fit(start, targets, params, backend))
 
     @cache
     def judges(footprint: float) -> list[_MeasuredView]:
-        return [
-            _MeasuredView(camera, _render(finer, camera))
-            for camera in _resized_views(views[kept], depths[kept], footprint)
-        ]
+        return measured_views(kept, footprint)
 
     level = max(fitted, start, key=lambda one: np.median(_psnr_db(one, judges(footprint))))
     shown, decibels = _measure(level, judges, footprint)
@@ -154,8 +158,9 @@ def _resized_views(views: Cameras, depths: np.ndarray, footprint: float) -> list
     return [views[v].resized(int(np.clip(longest[v], 24, views.sizes_px[v].max()))) for v in range(len(views))]
 
 
-def _render(gaussians: Gaussians, camera: Cameras) -> np.ndarray:
-    picture: np.ndarray = np.clip(render(gaussians, camera, depth=False, dominant_id=False).colour[0], 0, 1)
+def _render(gaussians: Gaussians, camera: Cameras, index: ChunkIndex | None = None) -> np.ndarray:
+    seen = render(gaussians, camera, depth=False, dominant_id=False, index=index)
+    picture: np.ndarray = np.clip(seen.colour[0], 0, 1)
     return picture
 
 
@@ -165,29 +170,19 @@ def _psnr_db(level: Gaussians, views: list[_MeasuredView]) -> np.ndarray:
     return -10 * np.log10(np.maximum(errors, 1e-10))
 
 
-def _fit(
-    start: Gaussians,
-    finer: Gaussians,
-    views: Cameras,
-    depths: np.ndarray,
-    footprint: float,
-    params: Params,
-    backend: str,
-) -> Gaussians:
+def _fit(start: Gaussians, targets: list[_MeasuredView], params: Params, backend: str) -> Gaussians:
     """Fit Gaussians, from initial values, to renders of the finer level."""
-    seen = _resized_views(views, depths, footprint)
-    wanted = [_render(finer, camera) for camera in seen]
     size = float(np.exp(np.median(start.log_scales.max(1))))
     fitter = make_fitter(start, options=FitOptions(ssim_weight=0.2), backend=backend)
-    pictures = [fitter.load(picture[None]) for picture in wanted]
+    pictures = [fitter.load(target.picture[None]) for target in targets]
     rng = np.random.default_rng(0)
-    turns = -(-params.steps // len(seen))
-    order = np.concatenate([rng.permutation(len(seen)) for _ in range(turns)] or [np.zeros(0, int)])[: params.steps]
+    turns = -(-params.steps // len(targets))
+    order = np.concatenate([rng.permutation(len(targets)) for _ in range(turns)] or [np.zeros(0, int)])[: params.steps]
     for step, v in enumerate(order.tolist()):
         share = _LAST ** (step / params.steps)
         rates = {name: rate * share for name, rate in vars(_FIRST).items()}
         fitter.learning_rates = LearningRates(**rates | {"means": rates["means"] * size})
-        fitter.step(seen[v], pictures[v])
+        fitter.step(targets[v].camera, pictures[v])
     return fitter.gaussians()
 
 
