@@ -217,14 +217,17 @@ def _start(
     """
     gaussians, origin = concatenate_scenes(scenes)
     near = inside(gaussians.means, bounds, params.halo_m)
+    num_inside = int(inside(gaussians.means, bounds).sum())
+    gaussians, origin = gaussians[near], origin[near]  # of the concatenation nothing else stays in memory
     new = np.concatenate(settled.changed)[near]
-    labels = voxel_labels(gaussians.means[near], params.voxel_m)
+    labels = voxel_labels(gaussians.means, params.voxel_m)
     # A new Gaussian shares its voxel with no other Gaussian.
     labels[new] = labels.max(initial=-1) + 1 + np.arange(int(new.sum()))
     labels = np.unique(labels, return_inverse=True)[1]
-    merged, heaviest = merge_groups(gaussians[near], labels)
+    merged, heaviest = merge_groups(gaussians, labels)
+    del gaussians
     visible = np.bincount(labels, np.concatenate(wanted.visible_pixels)[near], minlength=len(merged))
-    origin, new = origin[near][heaviest], new[heaviest]
+    origin, new = origin[heaviest], new[heaviest]
     stays = np.ones(len(merged), dtype=bool)
     if params.owner_cells:
         # Gaussians that are occluded in newer scenes do not count in the selection of an owner.
@@ -238,7 +241,7 @@ def _start(
     stays |= new
     stays[near_other_scene(merged.means, origin, new, _BESIDE_M)] = False
     mine = inside(merged.means, bounds)
-    count = max(int(params.kept_fraction * inside(gaussians.means, bounds).sum()) - int((new & mine).sum()), 1)
+    count = max(int(params.kept_fraction * num_inside) - int((new & mine).sum()), 1)
     many = stays & mine & ~new
     if params.kept_fraction == 1 or many.sum() <= count:
         return merged[stays], origin[stays], new[stays]
