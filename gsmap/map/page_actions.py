@@ -36,7 +36,7 @@ class EditableMap(Protocol):
 
 
 def actions_of(opened: EditableMap) -> dict[str, Action]:
-    """Return the actions by their names in `contract.ts`."""
+    """Return the actions by their names in `gsmap.view.contract.Actions`."""
     return {
         "confirm": partial(_review, opened.confirm),
         "reject": partial(_review, opened.reject),

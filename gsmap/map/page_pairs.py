@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,6 +12,7 @@ from gsmap.map.reports import pair_report
 from gsmap.store import Store
 from gsmap.types import NodeLayer, Scene, SceneGraph, Sim3
 from gsmap.types.rows.pairs import ExplanationStep
+from gsmap.view.contract import PairDetail
 
 if TYPE_CHECKING:
     from gsmap.map.settings import Settings
@@ -23,8 +24,8 @@ _LAYERS = ("landmarks", "landmarks:1", "objects")
 
 def pair_detail(
     store: Store, settings: Settings, a: Scene, b: Scene, S_map_target: Sim3, *, has_buttons: bool = False
-) -> dict[str, Any]:
-    """Return the `EdgeDetail` of a pair, without its scenes and views.
+) -> PairDetail:
+    """Return the explanation of a pair, without its scenes and views.
 
     Args:
         S_map_target: the shown pose of the target.

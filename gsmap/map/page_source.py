@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import threading
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,8 +32,9 @@ from gsmap.store import Store, cache
 from gsmap.types import GaussianSource, PoseGraph, Prior, Scene
 from gsmap.types.plain import canonical
 from gsmap.types.world import ImagePoint
-from gsmap.view import ViewChange, ViewEdge, ViewMap, ViewPhoto, ViewRevision, ViewScene
+from gsmap.view import ViewMap, ViewScene, contract
 from gsmap.view.content import up_of
+from gsmap.view.contract import FloorPlan, GraphEntry, PlacedPairDetail, PlaceHistory, RevisionPoses, SceneExtras
 from gsmap.view.page_source import Action, PairPictures
 from gsmap.view.pair_picture import looks_at
 from gsmap.view.trees import VERSION, TreeParams
@@ -93,7 +94,7 @@ class MapPageSource:
             raise NotFoundError(f"scene {scene} was removed", code="scene_removed")
         return self._store.scenes.source(scene)
 
-    def extras(self, scene: str) -> dict[str, Any]:
+    def extras(self, scene: str) -> SceneExtras:
         """Return nodes and cameras of a scene in the map frame."""
         entry = self._entry(scene)
         S = entry.S_map_scene
@@ -115,7 +116,7 @@ class MapPageSource:
                 frusta.append(S.apply(local @ pose[:3, :3].T + pose[:3, 3]).tolist())
         return {"layers": layers, "cameras": frusta}
 
-    def revision(self, number: int) -> dict[str, Any]:
+    def revision(self, number: int) -> RevisionPoses:
         graph = self._store.revisions.get(number)
         if graph is None:
             raise NotFoundError(f"there is no revision {number}", code="revision_not_found")
@@ -134,7 +135,7 @@ class MapPageSource:
             ],
         }
 
-    def plan(self, component: int) -> dict[str, Any]:
+    def plan(self, component: int) -> FloorPlan:
         """Return the floor plan of a component, drawn as in the report."""
         view = self.content()
         inside = {
@@ -184,13 +185,13 @@ class MapPageSource:
 
     # --- pairs and changes -------------------------------------------------------------------------------------------
 
-    def edge(self, target: str, source: str) -> dict[str, Any]:
+    def edge(self, target: str, source: str) -> PlacedPairDetail:
         a, b = self._entry(target), self._entry(source)
         at = self._places()
-        ends = {"target": at[target], "source": at[source]}
-        return ends | pair_detail(
+        detail = pair_detail(
             self._store, self._settings, a.scene, b.scene, a.S_map_scene, has_buttons=bool(self.actions)
         )
+        return {**detail, "target": at[target], "source": at[source]}
 
     def pair_cameras(self, target: str, source: str) -> tuple[str, ...]:
         stored = self._store.registrations.get(target, source)
@@ -223,7 +224,7 @@ class MapPageSource:
 
     # --- objects -----------------------------------------------------------------------------------------------------
 
-    def graph(self) -> dict[str, Any]:
+    def graph(self) -> GraphEntry:
         known = self._known()
         report = objects_report(known)
         boxes = {thing.id: thing.box for thing in known.objects}
@@ -246,9 +247,9 @@ class MapPageSource:
                 for row in report.objects
             ],
             "changes": {
-                one.id: room
+                one["id"]: room
                 for one in self.content().changes
-                if (room := known.room_of_box(one.component, one.box)) is not None
+                if (room := known.room_of_box(one["component"], np.array(one["box"]))) is not None
             },
             "relations": [{"a": one.subject, "b": one.other, "kind": one.relation} for one in report.relations],
             "rooms": [
@@ -257,7 +258,7 @@ class MapPageSource:
                     "component": row.component,
                     "outline": row.outline.tolist(),
                     "area_m2": row.area_m2,
-                    "doors": row.doors,
+                    "doors": list(row.doors),
                 }
                 for row in report.rooms
             ],
@@ -271,7 +272,7 @@ class MapPageSource:
             drawer = self._drawer[1]
         return drawer.draw(id)
 
-    def history(self, at: str, component: int) -> dict[str, Any]:
+    def history(self, at: str, component: int) -> PlaceHistory:
         known, places = self._known(), self._places()
         inside = {thing.id for thing in known.objects if thing.component == component}
         report = history_report(known, at, None)
@@ -326,30 +327,40 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
         _scene(scene, content_key(scene, TreeParams()), poses, ups, told, scene.id in alone)
         for scene in store.scenes.list()
     ]
-    living = {entry.scene.id for entry in scenes}
+    at = {entry.scene.id: place for place, entry in enumerate(scenes)}
     newest, given = store.revisions.newest(), pose_basis(store, settings)
     asked = plan_comparisons(store, settings) if placed else None
     missing = missing_comparisons(store, asked, settings) if asked else []
     found = ViewMap(
         Path(store.location).name,
         scenes,
-        _edges(store, placed),
+        _edges(store, placed, at),
         [
-            ViewRevision(row.number, row.created_at, row.scenes, row.edges_used, row.dropped_at is None)
+            {
+                "id": row.number,
+                "created_at": row.created_at,
+                "num_scenes": row.scenes,
+                "num_edges_used": row.edges_used,
+                "poses": f"revisions/{row.number}.json" if row.dropped_at is None else None,
+            }
             for row in reports.revision_rows(store)
         ],
-        _changes(store, settings, asked, living),
-        _photos(store, placed, living),
+        _changes(store, settings, asked, at),
+        _photos(store, placed, at),
         revision=store.revisions.newest_number(),
         metres_per_unit={component: metre.metres_per_unit for component, metre in metres.items()},
         scale_sigma={component: metre.sigma for component, metre in metres.items() if not metre.is_rough},
-        compared=[pair for pair in asked.pairs if pair not in missing] if asked else [],
-        uncompared=missing,
+        compared=_indices((pair for pair in asked.pairs if pair not in missing), at) if asked else [],
+        uncompared=_indices(missing, at),
         merged=merged,
         has_objects=placed is not None and bool(graphs),
         stale=bool(given.scenes) and (newest is None or newest.key != given.key.digest),
     )
     return replace(found, state=text_digest(canonical([found, store.objects.facts()]))[:24])
+
+
+def _indices(pairs: Iterable[tuple[str, str]], at: Mapping[str, int]) -> list[list[int]]:
+    return [[at[a], at[b]] for a, b in pairs if a in at and b in at]
 
 
 def prior_words(prior: Prior, metres_per_unit: float) -> str:
@@ -387,12 +398,14 @@ def content_key(scene: Scene, tree: TreeParams) -> str:
     return f"{scene.id}{thinned}-v{VERSION}-{text_digest(canonical(tree))[:8]}"
 
 
-def _edges(store: Store, placed: PoseGraph | None) -> list[ViewEdge]:
+def _edges(store: Store, placed: PoseGraph | None, at: Mapping[str, int]) -> list[contract.EdgeEntry]:
     outcomes = placed.outcomes if placed else {}
     current = {(one.registration.target, one.registration.source): one for one in store.registrations.current()}
-    out = []
+    out: list[contract.EdgeEntry] = []
     for row in reports.edge_rows(store):
         pair = (row.target, row.source)
+        if not at.keys() >= {*pair}:
+            continue
         stored, outcome = current.get(pair), outcomes.get(pair)
         probability = float("nan") if stored is None else stored.registration.evidence.get("probability", float("nan"))
         known = float(probability) if np.isfinite(probability) else None
@@ -402,45 +415,50 @@ def _edges(store: Store, placed: PoseGraph | None) -> list[ViewEdge]:
             note = words[-1].note if words else ""
         chi2 = None if outcome is None else outcome.residual_chi2
         out.append(
-            ViewEdge(
-                *pair,
-                status=row.status,
-                reason=row.reason,
-                used=row.used if placed else None,
-                one_pair=outcome is not None and is_one_pair(outcome),
-                undecided=row.undecided,
-                review=row.review,
-                note=note,
-                probability=known,
-                overlap=row.overlap,
-                num_inliers=row.num_inliers,
-                doubt=EdgeEntry(row, chi2=chi2, probability=known).doubt,
-                registration=None if stored is None else stored.number,
-            )
+            {
+                "target": at[row.target],
+                "source": at[row.source],
+                "status": row.status,
+                "used": row.used if placed else None,
+                "one_pair": outcome is not None and is_one_pair(outcome),
+                "undecided": row.undecided,
+                "review": row.review,
+                "note": note,
+                "reason": row.reason,
+                "probability": known,
+                "overlap": row.overlap if np.isfinite(row.overlap) else 0.0,
+                "num_inliers": row.num_inliers,
+                "doubt": EdgeEntry(row, chi2=chi2, probability=known).doubt,
+                "registration": None if stored is None else stored.number,
+                "detail": f"edges/{row.target}-{row.source}.json",
+            }
         )
-    return out
+    return sorted(out, key=lambda edge: -edge["doubt"])
 
 
-def _changes(store: Store, settings: Settings, asked: ComparisonPlan | None, living: set[str]) -> list[ViewChange]:
+def _changes(
+    store: Store, settings: Settings, asked: ComparisonPlan | None, at: Mapping[str, int]
+) -> list[contract.ChangeEntry]:
     """Return the stored changes, without comparing scenes."""
     if asked is None:
         return []
     report = changes_report(store, settings, asked, min_confidence=settings.change.min_confidence)
     return [
-        ViewChange(
-            row.id,
-            row.kind,
-            row.component,
-            row.box,
-            row.older,
-            row.newer,
-            row.newer_at,
-            row.confidence,
-            row.status,
-            _note_of(store, row.id),
-        )
+        {
+            "id": row.id,
+            "kind": row.kind,
+            "component": row.component,
+            "box": row.box.tolist(),
+            "before": at[row.older],
+            "after": at[row.newer],
+            "at": row.newer_at,
+            "confidence": row.confidence if np.isfinite(row.confidence) else 0.0,
+            "status": row.status,
+            "note": _note_of(store, row.id),
+            "pictures": [f"changes/{row.id}-{side}.jpg" for side in ("before", "after")],
+        }
         for row in report.changes
-        if row.box is not None and row.component is not None and {row.older, row.newer} <= living
+        if row.box is not None and row.component is not None and at.keys() >= {row.older, row.newer}
     ]
 
 
@@ -449,7 +467,7 @@ def _note_of(store: Store, change: str) -> str:
     return words[-1].note if words and words[-1].review != "withdraw" else ""
 
 
-def _photos(store: Store, placed: PoseGraph | None, living: set[str]) -> list[ViewPhoto]:
+def _photos(store: Store, placed: PoseGraph | None, living: Collection[str]) -> list[contract.PhotoEntry]:
     """Return the photos stored in the map and the photos localized for control points."""
     found: dict[tuple[str, str], ImagePoint] = {}
     for one in store.world.survey().images:
@@ -461,13 +479,26 @@ def _photos(store: Store, placed: PoseGraph | None, living: set[str]) -> list[Vi
         pose = placed.poses[one.scene]
         T = transform_poses(one.T_scene_camera, pose.S_map_scene)
         width, height = np.maximum(1, np.round(2 * one.intrinsics_px[2:])).astype(int).tolist()
-        out.append(ViewPhoto(one.image, pose.component, T, one.intrinsics_px, (width, height)))
+        out.append(_photo(one.image, pose.component, T, one.intrinsics_px, [width, height]))
     for row in photo_rows(store):
         if row.component is not None and row.T_map_camera is not None and row.scene in living:
             out.append(
-                ViewPhoto(row.file, row.component, row.T_map_camera, row.intrinsics_px, row.size_px, row.captured_at)
+                _photo(row.file, row.component, row.T_map_camera, row.intrinsics_px, [*row.size_px], row.captured_at)
             )
     return out
+
+
+def _photo(
+    file: str, component: int, T: np.ndarray, intrinsics_px: np.ndarray, size: list[int], at: str | None = None
+) -> contract.PhotoEntry:
+    return {
+        "file": file,
+        "component": component,
+        "T_map_camera": T.tolist(),
+        "intrinsics": intrinsics_px.tolist(),
+        "size": size,
+        "captured_at": at,
+    }
 
 
 def cache_folder() -> Path:

@@ -8,8 +8,8 @@ on this machine only::
         server.serve_forever()
 """
 
-from gsmap.view.content import ViewChange, ViewEdge, ViewMap, ViewPhoto, ViewRevision, ViewScene
+from gsmap.view.content import ViewMap, ViewScene
 from gsmap.view.params import Params
 from gsmap.view.server import ViewServer
 
-__all__ = ["Params", "ViewChange", "ViewEdge", "ViewMap", "ViewPhoto", "ViewRevision", "ViewScene", "ViewServer"]
+__all__ = ["Params", "ViewMap", "ViewScene", "ViewServer"]

@@ -1,4 +1,4 @@
-"""Compute the response to each address of the page's server, as `gsmap/view/page/src/contract.ts` defines it."""
+"""Compute the response to each address of the page's server, as `gsmap.view.contract` defines it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
-from typing import Any
 
 import numpy as np
 
 from gsmap.durable import open_file
 from gsmap.errors import ConfigError, CorruptError, NotFoundError
 from gsmap.view.content import ServerState, ViewMap, ViewScene, summary
+from gsmap.view.contract import EdgeDetail, EdgeView, MapSummary, TreeProgress
 from gsmap.view.levels import Levels
 from gsmap.view.making import PendingResult
 from gsmap.view.page_source import PageSource, PairPictures
@@ -129,7 +129,7 @@ class Answers:
                 self._content = state, self._page_source.content()
             return self._content[1]
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> MapSummary:
         """Return the current ``map.json``."""
         view = self.content()
         overviews, levels = self._levels.overviews(view)
@@ -221,13 +221,17 @@ class Answers:
     def _edge(self, target: str, source: str) -> Answer:
         return Answer.json(self.edge(target, source))
 
-    def edge(self, target: str, source: str) -> dict[str, Any]:
+    def edge(self, target: str, source: str) -> EdgeDetail:
         """Return the `EdgeDetail` of a pair of scene ids."""
         detail = self._page_source.edge(target, source)
         at = f"edges/{target}-{source}"
-        names = ("target", "source", "difference")
-        views = [
-            {"camera": camera, **{name: f"{at}/{i}-{name}.jpg" for name in names}}
+        views: list[EdgeView] = [
+            {
+                "camera": camera,
+                "target": f"{at}/{i}-target.jpg",
+                "source": f"{at}/{i}-source.jpg",
+                "difference": f"{at}/{i}-difference.jpg",
+            }
             for i, camera in enumerate(self._page_source.pair_cameras(target, source))
         ]
         return {**detail, "views": views}
@@ -289,8 +293,8 @@ def _state(of_map: str, of_levels: str) -> str:
 
 
 def _waiting(found: PendingResult) -> Answer:
-    retry_s = min(_LONGEST_S, _RETRY_S + _EACH_S * found.waiting)
-    status = {"progress": round(found.progress, 4), "waiting": found.waiting, "retry_s": round(retry_s, 2)}
+    retry_s = round(min(_LONGEST_S, _RETRY_S + _EACH_S * found.waiting), 2)
+    status: TreeProgress = {"progress": round(found.progress, 4), "waiting": found.waiting, "retry_s": retry_s}
     return Answer.json(status, HTTPStatus.ACCEPTED)
 
 

@@ -1,11 +1,10 @@
-"""The content of the page, as `gsmap/view/page/src/contract.ts` defines it, and its conversion to JSON.
+"""The content of the page, and its conversion to the JSON that `gsmap.view.contract` defines.
 
 This module reads no files; `gsmap.view.page_source` loads what the page requests.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,8 +16,16 @@ from gsmap.geometry.uncertainty import middle_covariance_m2
 from gsmap.types import Scene, ScenePose, Sim3
 from gsmap.types.plain import fields_of, plain
 from gsmap.types.scene import SceneFacts
+from gsmap.view.contract import (
+    ChangeEntry,
+    EdgeEntry,
+    MapSummary,
+    Overview,
+    PhotoEntry,
+    RevisionEntry,
+    SceneEntry,
+)
 
-SCHEMA = 1
 UNPLACED_UP = (0.0, -1.0, 0.0)
 """Up direction assumed for a scene whose up direction is unknown, as frames of trainers are right, down, front."""
 
@@ -50,115 +57,21 @@ class ViewScene:
         return self.pose.S_map_scene if self.pose is not None else Sim3.identity()
 
 
-@dataclass(frozen=True)
-class ViewEdge:
-    """A registered pair of scenes on the page.
-
-    Args:
-        target, source: Scene ids.
-        status: ``accepted``, ``rejected`` or ``no_match``, after any review.
-        reason: Reason for the status.
-        used: Use in the newest revision: True, False or ``"tentative"``; None if it has not been optimized.
-        one_pair: It is tentative only because no cycle confirms it; nothing contradicts it.
-        undecided: The edge contradicts others, without evidence for either.
-        review: Current review, ``confirm`` or ``reject``; None if unreviewed.
-        note: Note of the review.
-        probability: Probability that the pose is right; None if unknown.
-        overlap: Overlap of the scenes, in [0, 1].
-        num_inliers: Number of inliers.
-        doubt: Urgency of a review, in [0, 1].
-        registration: Number of its current registration; None if it has none.
-    """
-
-    target: str
-    source: str
-    status: str
-    reason: str = ""
-    used: bool | str | None = None
-    one_pair: bool = False
-    undecided: bool = False
-    review: str | None = None
-    note: str = ""
-    probability: float | None = None
-    overlap: float = 0.0
-    num_inliers: int = 0
-    doubt: float = 0.0
-    registration: int | None = None
-
-
-@dataclass(frozen=True)
-class ViewRevision:
-    """A revision on the page; ``is_kept`` is true if its poses are still stored."""
-
-    id: int
-    created_at: str
-    num_scenes: int
-    num_edges_used: int
-    is_kept: bool = True
-
-
-@dataclass(frozen=True, eq=False)
-class ViewChange:
-    """A change between two scenes on the page.
-
-    Args:
-        id: Id of the change, such as ``c12``.
-        kind: Kind of the change.
-        component: Component of the scenes.
-        box: (2, 3) bounding box in the map frame.
-        before, after: Scene ids.
-        at: Date of the later scene.
-        confidence: Confidence in [0, 1].
-        status: Status of its review.
-        note: Note of the review.
-    """
-
-    id: str
-    kind: str
-    component: int
-    box: np.ndarray
-    before: str
-    after: str
-    at: str | None
-    confidence: float
-    status: str
-    note: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class ViewPhoto:
-    """A localized photo on the page.
-
-    Args:
-        file: File name.
-        component: Component of the pose.
-        T_map_camera: (4, 4) pose in the map frame.
-        intrinsics_px: (4,) fx, fy, cx, cy.
-        size_px: Width and height.
-        captured_at: Date of the photo.
-    """
-
-    file: str
-    component: int
-    T_map_camera: np.ndarray
-    intrinsics_px: np.ndarray
-    size_px: tuple[int, int]
-    captured_at: str | None = None
-
-
 @dataclass(frozen=True, eq=False)
 class ViewMap:
     """The content of the page at one time.
 
     Args:
         title: Name of the map.
-        scenes, edges, revisions, changes, photos: Content of the map.
+        scenes: Scenes of the map.
+        edges: Edges between these scenes, the most doubtful first.
+        revisions, changes, photos: Further content of the map.
         state: Opaque text that differs after every change of the map.
         revision: Revision of the poses; None before the first.
         metres_per_unit: Metres per map unit of each component.
         scale_sigma: Standard deviation of its logarithm; a component of unknown scale is missing.
         merged: Components with merged tiles.
-        compared: Pairs (older, newer) of scene ids that were compared for changes.
+        compared: Pairs (older, newer) of indices of scenes that were compared for changes.
         uncompared: Pairs that ``gsmap changes`` would compare.
         has_objects: The map has objects.
         stale: The poses are outdated, because edges or priors changed after the revision.
@@ -166,17 +79,17 @@ class ViewMap:
 
     title: str
     scenes: Sequence[ViewScene] = ()
-    edges: Sequence[ViewEdge] = ()
-    revisions: Sequence[ViewRevision] = ()
-    changes: Sequence[ViewChange] = ()
-    photos: Sequence[ViewPhoto] = ()
+    edges: Sequence[EdgeEntry] = ()
+    revisions: Sequence[RevisionEntry] = ()
+    changes: Sequence[ChangeEntry] = ()
+    photos: Sequence[PhotoEntry] = ()
     state: str = ""
     revision: int | None = None
     metres_per_unit: Mapping[int, float] = field(default_factory=dict)
     scale_sigma: Mapping[int, float] = field(default_factory=dict)
     merged: frozenset[int] = frozenset()
-    compared: Sequence[tuple[str, str]] = ()
-    uncompared: Sequence[tuple[str, str]] = ()
+    compared: Sequence[list[int]] = ()
+    uncompared: Sequence[list[int]] = ()
     has_objects: bool = False
     stale: bool = False
 
@@ -245,10 +158,9 @@ class ServerState:
     drawn: frozenset[str] = frozenset()
 
 
-def summary(view: ViewMap, served: ServerState) -> dict[str, Any]:
+def summary(view: ViewMap, served: ServerState) -> MapSummary:
     """Return the content of ``map.json``, which has the lists of the page."""
     components = view.components()
-    at = {entry.scene.id: index for index, entry in enumerate(view.scenes)}
     boxes = [served.boxes.get(entry.key, entry.scene.bounds) for entry in view.scenes]
     corners = [entry.S_map_scene.apply(box_corners(box)) for entry, box in zip(view.scenes, boxes, strict=True)]
     for overview in served.overviews.values():
@@ -258,10 +170,8 @@ def summary(view: ViewMap, served: ServerState) -> dict[str, Any]:
     members: dict[int, list[int]] = {}
     for index, component in enumerate(components):
         members.setdefault(component, []).append(index)
-    edges = [edge for edge in view.edges if edge.target in at and edge.source in at]
-    edges.sort(key=lambda edge: -edge.doubt)
     return {
-        "schema": SCHEMA,
+        "schema": 1,
         "state": view.state,
         "title": view.title,
         "actions": served.actions,
@@ -285,49 +195,14 @@ def summary(view: ViewMap, served: ServerState) -> dict[str, Any]:
             _scene(entry, component, box, entry_corners, view.metres_per_unit.get(component, 1.0))
             for entry, component, box, entry_corners in zip(view.scenes, components, boxes, corners, strict=True)
         ],
-        "edges": [_edge(edge, at) for edge in edges],
-        "revisions": [
-            {
-                "id": one.id,
-                "created_at": one.created_at,
-                "num_scenes": one.num_scenes,
-                "num_edges_used": one.num_edges_used,
-                "poses": f"revisions/{one.id}.json" if one.is_kept else None,
-            }
-            for one in view.revisions
-        ],
+        "edges": list(view.edges),
+        "revisions": list(view.revisions),
         "changes": [
-            {
-                "id": one.id,
-                "kind": one.kind,
-                "component": one.component,
-                "box": one.box.tolist(),
-                "before": at[one.before],
-                "after": at[one.after],
-                "at": one.at,
-                "confidence": _number(one.confidence) or 0.0,
-                "status": one.status,
-                "note": one.note,
-                "pictures": [f"changes/{one.id}-{name}.jpg" for name in ("before", "after")]
-                if served.live or one.id in served.drawn
-                else None,
-            }
-            for one in view.changes
-            if one.before in at and one.after in at
+            one if served.live or one["id"] in served.drawn else {**one, "pictures": None} for one in view.changes
         ],
-        "compared": [[at[a], at[b]] for a, b in view.compared if a in at and b in at],
-        "uncompared": [[at[a], at[b]] for a, b in view.uncompared if a in at and b in at],
-        "photos": [
-            {
-                "file": one.file,
-                "component": one.component,
-                "T_map_camera": one.T_map_camera.tolist(),
-                "intrinsics": one.intrinsics_px.tolist(),
-                "size": list(one.size_px),
-                "captured_at": one.captured_at,
-            }
-            for one in view.photos
-        ],
+        "compared": list(view.compared),
+        "uncompared": list(view.uncompared),
+        "photos": list(view.photos),
         "counts": {"gaussians": sum(entry.scene.num_gaussians for entry in view.scenes)},
         "graph": "graph.json" if view.has_objects else None,
         "history": "history.json" if served.live else None,
@@ -357,8 +232,7 @@ def _scene(
     if covariance_m2 is not None:
         sigma_m = float(np.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance_m2)[-1]))))
         ellipsoid = (covariance_m2 / metres_per_unit**2).tolist()
-    return {
-        **{name: plain(value) for name, value in fields_of(scene, SceneFacts).items()},
+    placed: SceneEntry = {
         "component": component,
         "status": "one pair" if entry.one_pair else pose.status if pose is not None else "not placed",
         "S_map_scene": entry.S_map_scene.matrix().tolist(),
@@ -373,33 +247,18 @@ def _scene(
         "prior": entry.prior,
         "prior_number": entry.prior_number,
     }
+    return {name: plain(value) for name, value in fields_of(scene, SceneFacts).items()} | placed
 
 
-def _edge(edge: ViewEdge, at: Mapping[str, int]) -> dict[str, Any]:
-    return {
-        "target": at[edge.target],
-        "source": at[edge.source],
-        "status": edge.status,
-        "used": edge.used,
-        "one_pair": edge.one_pair,
-        "undecided": edge.undecided,
-        "review": edge.review,
-        "note": edge.note,
-        "reason": edge.reason,
-        "probability": _number(edge.probability),
-        "overlap": _number(edge.overlap) or 0.0,
-        "num_inliers": edge.num_inliers,
-        "doubt": edge.doubt,
-        "detail": f"edges/{edge.target}-{edge.source}.json",
-    }
-
-
-def _overview(one: ViewOverview | None) -> dict[str, Any] | None:
+def _overview(one: ViewOverview | None) -> Overview | None:
     if one is None:
         return None
-    data = {"uri": one.uri, "pending": one.pending, "scenes": list(one.scenes), "counts": list(one.counts)}
     extent = one.extent
-    return data | {
+    return {
+        "uri": one.uri,
+        "pending": one.pending,
+        "scenes": list(one.scenes),
+        "counts": list(one.counts),
         "frame": None if extent is None else extent.frame.tolist(),
         "outline": None if extent is None else extent.outline.tolist(),
         "size": None if extent is None else list(extent.size),
@@ -412,7 +271,3 @@ def _box(overview: ViewOverview | None, corners: Sequence[np.ndarray]) -> np.nda
     if overview is not None and overview.extent is not None and not overview.pending:
         return overview.extent.box
     return box_around(np.concatenate(corners))
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)

@@ -11,9 +11,10 @@ import numpy as np
 
 from gsmap.types import GaussianSource
 from gsmap.view.content import ViewMap
+from gsmap.view.contract import FloorPlan, GraphEntry, PlacedPairDetail, PlaceHistory, RevisionPoses, SceneExtras
 
 Action = Callable[[Mapping[str, Any]], None]
-"""Applies an action of the page, with the fields of `contract.ts`; raises `gsmap.errors.GsmapError`."""
+"""Applies an action of the page, with the fields of `gsmap.view.contract`; raises `gsmap.errors.GsmapError`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +35,7 @@ class PairPictures:
 class PageSource(Protocol):
     """The content of a map for the page.
 
-    Every method is thread-safe and may raise `GsmapError`, for missing items `NotFoundError`. Returned dicts are JSON
-    of `contract.ts`.
+    Every method is thread-safe and may raise `GsmapError`, for missing items `NotFoundError`.
     """
 
     def state(self) -> str:
@@ -50,11 +50,11 @@ class PageSource(Protocol):
         """Return the Gaussians of a scene by id, in Morton order."""
         ...
 
-    def extras(self, scene: str) -> dict[str, Any]: ...
+    def extras(self, scene: str) -> SceneExtras: ...
 
-    def revision(self, number: int) -> dict[str, Any]: ...
+    def revision(self, number: int) -> RevisionPoses: ...
 
-    def edge(self, target: str, source: str) -> dict[str, Any]:
+    def edge(self, target: str, source: str) -> PlacedPairDetail:
         """Return the `EdgeDetail` of a pair, without its views."""
         ...
 
@@ -68,15 +68,15 @@ class PageSource(Protocol):
         """Return the place before and after a change from the same camera, (H, W, 3) uint8 each."""
         ...
 
-    def plan(self, component: int) -> dict[str, Any]:
+    def plan(self, component: int) -> FloorPlan:
         """Return the floor plan of a component with poses."""
         ...
 
-    def graph(self) -> dict[str, Any]: ...
+    def graph(self) -> GraphEntry: ...
 
     def object_picture(self, id: str) -> np.ndarray: ...
 
-    def history(self, at: str, component: int) -> dict[str, Any]: ...
+    def history(self, at: str, component: int) -> PlaceHistory: ...
 
     def merged(self, component: int) -> Path:
         """Return the folder of merged tiles of a component."""

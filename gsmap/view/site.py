@@ -116,17 +116,18 @@ class _Maker:
             extras = self.tried(entry.scene.name, lambda e=entry: self.page_source.extras(e.scene.id))  # type: ignore[misc]
             yield f"scenes/{entry.scene.id}/extras.json", _json(extras or {"layers": {}, "cameras": []})
         for revision in view.revisions:
-            if revision.is_kept:
-                yield f"revisions/{revision.id}.json", _json(self.page_source.revision(revision.id))
+            if revision["poses"] is not None:
+                yield revision["poses"], _json(self.page_source.revision(revision["id"]))
         yield from self._edges(view, pictures)
         drawn = []
-        surest = sorted(view.changes, key=lambda change: -change.confidence)
+        surest = sorted(view.changes, key=lambda change: -change["confidence"])
         for change in surest[: self.params.site_changes if pictures else 0]:
-            pair = self.tried(f"change {change.id}", lambda c=change: self.page_source.change_pictures(c.id))  # type: ignore[misc]
+            name = change["id"]
+            pair = self.tried(f"change {name}", partial(self.page_source.change_pictures, name))
             if pair is not None:
-                drawn.append(change.id)
-                for name, picture in zip(("before", "after"), pair, strict=True):
-                    yield f"changes/{change.id}-{name}.jpg", jpeg(picture)
+                drawn.append(name)
+                for side, picture in zip(("before", "after"), pair, strict=True):
+                    yield f"changes/{name}-{side}.jpg", jpeg(picture)
         has_objects = False
         if view.has_objects:
             graph = self.tried("the graph of objects", self.page_source.graph)
@@ -142,17 +143,13 @@ class _Maker:
                     objects.append({**one, "picture": None if picture is None else f"objects/{one['id']}.jpg"})
                 yield "graph.json", _json({**graph, "objects": objects})
         served = ServerState(False, boxes, overviews, live=False, drawn=frozenset(drawn))
-        said = summary(view, served)
-        yield "map.json", _json(said | {"graph": "graph.json" if has_objects else None})
+        yield "map.json", _json({**summary(view, served), "graph": "graph.json" if has_objects else None})
 
     def _edges(self, view: ViewMap, pictures: bool) -> Iterator[tuple[str, bytes]]:
         answers = Answers(self.page_source, self.levels)
-        living = {entry.scene.id for entry in view.scenes}
-        edges = [edge for edge in view.edges if {edge.target, edge.source} <= living]
-        edges.sort(key=lambda edge: -edge.doubt)
-        for place, edge in enumerate(edges):
-            self.progress(0.7 + 0.3 * place / len(edges), "edges")
-            pair, views = (edge.target, edge.source), []
+        for place, edge in enumerate(view.edges):
+            self.progress(0.7 + 0.3 * place / len(view.edges), "edges")
+            pair, views = (view.scenes[edge["target"]].scene.id, view.scenes[edge["source"]].scene.id), []
             detail = self.tried(f"edge {pair}", lambda p=pair: answers.edge(*p))  # type: ignore[misc]
             if detail is None:
                 continue

@@ -9,6 +9,12 @@ from view_room import POSE_B, A, B, C, MadeDoors
 from gsmap.geometry.boxes import box_corners
 from gsmap.view import ViewMap
 from gsmap.view.content import ServerState, ViewExtent, ViewOverview, summary
+from tools.make import page_contract
+
+
+def test_the_types_of_the_page_are_those_of_the_server():
+    stale = "run python -m tools.make.page_contract"
+    assert page_contract.FILE.read_text(encoding="utf-8") == page_contract.source(), stale
 
 
 def test_summary_tells_where_everything_is():
@@ -19,7 +25,6 @@ def test_summary_tells_where_everything_is():
     np.testing.assert_allclose(said["scenes"][1]["S_map_scene"], POSE_B.matrix())
     low = view.scenes[1].scene.bounds[0]
     np.testing.assert_allclose(said["scenes"][1]["corners"][0], POSE_B.apply(low))
-    # Most doubtful first; those of scenes that are gone are left out.
     assert [(e["target"], e["source"], e["doubt"]) for e in said["edges"]] == [(0, 1, 0.7), (0, 2, 0.0)]
     assert said["edges"][0]["detail"] == f"edges/{A}-{B}.json"
     assert said["scenes"][2]["extras"] == f"scenes/{C}/extras.json"

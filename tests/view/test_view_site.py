@@ -19,7 +19,7 @@ from view_room import A, B, C, MadeDoors, blob, page_folder
 
 from gsmap.errors import GsmapError, InputError, NotFoundError
 from gsmap.formats import spz
-from gsmap.view import Params, ViewChange
+from gsmap.view import Params
 from gsmap.view.built import built_page
 from gsmap.view.levels import Levels
 from gsmap.view.site import write_page, write_site
@@ -40,8 +40,9 @@ def page_source(tmp_path):
     (folder / "levels" / "x.glb").write_bytes(b"glTF")
     (folder / "note.txt").write_text("of no use to a page")
     found.merged_folder = folder
-    box = np.array([[0.0, 0, 0], [1, 1, 1]])
-    change = ViewChange("c3", "moved", 0, box, A, B, None, 0.9, "open")
+    change = {"id": "c3", "kind": "moved", "component": 0, "box": [[0.0, 0, 0], [1, 1, 1]], "before": 0, "after": 1}
+    change |= {"at": None, "confidence": 0.9, "status": "open", "note": ""}
+    change["pictures"] = ["changes/c3-before.jpg", "changes/c3-after.jpg"]
     found.view = replace(found.view, merged=frozenset([0]), changes=[change], has_objects=True)
     found.change_pictures = lambda name: (np.zeros((4, 6, 3), np.uint8),) * 2
     return found

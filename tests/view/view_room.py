@@ -14,7 +14,8 @@ import numpy as np
 from gsmap.errors import InputError, NotFoundError
 from gsmap.geometry.morton import morton_order
 from gsmap.types import Gaussians, GaussianSource, Scene, ScenePose, Sim3
-from gsmap.view import ViewEdge, ViewMap, ViewScene, ViewServer
+from gsmap.view import ViewMap, ViewScene, ViewServer
+from gsmap.view.contract import EdgeEntry
 from gsmap.view.page_source import PairPictures
 
 A, B, C = ("a" * 32, "b" * 32, "c" * 32)
@@ -36,6 +37,14 @@ def blob(seed: int, n: int = 400, sh_degree: int = 0) -> Gaussians:
 def entry(scene: str, name: str, g: Gaussians, pose: ScenePose | None) -> ViewScene:
     bounds = np.stack([g.means.min(0), g.means.max(0)]).astype(float)
     return ViewScene(Scene(scene, name, len(g), g.sh_degree, 0, bounds), f"{scene}-v1", pose)
+
+
+def edge(pair: tuple[int, int], status: str, **more: Any) -> EdgeEntry:
+    made: Any = {"target": pair[0], "source": pair[1], "status": status, "used": None, "review": None}
+    made |= {"note": "", "reason": "", "probability": None, "registration": None, "one_pair": False}
+    made |= {"undecided": False, "overlap": 0.0, "num_inliers": 0, "doubt": 0.0}
+    made["detail"] = "edges/{}-{}.json".format(*((A, B, C)[i] for i in pair))
+    return made | more
 
 
 def turn(angle: float) -> np.ndarray:
@@ -66,9 +75,8 @@ class MadeDoors:
             entry(C, "far <b>away</b>", self.gaussians[C], None),
         ]
         edges = [
-            ViewEdge(A, "d" * 32, "no_match"),
-            ViewEdge(A, C, "rejected", doubt=0.0),
-            ViewEdge(A, B, "accepted", used="tentative", num_inliers=21, overlap=0.4, doubt=0.7),
+            edge((0, 1), "accepted", used="tentative", num_inliers=21, overlap=0.4, doubt=0.7),
+            edge((0, 2), "rejected"),
         ]
         self.view = ViewMap("a map", scenes, edges, state="s1", revision=1)
 
