@@ -11,8 +11,9 @@ from gsmap.register.duplicate import find_duplicate
 from gsmap.register.evidence import PoseEvidence, measure
 from gsmap.register.metric_scene import MetricPair, own_working_m
 from gsmap.register.params import Params
-from gsmap.register.pose_selection import EvaluatedPose, is_same_pose, select_pose
+from gsmap.register.pose_selection import EvaluatedPose, contradiction_of, is_same_pose, odds_of, select_pose
 from gsmap.register.proposal_rounds import ProposalRounds
+from gsmap.register.repetition import Repetition
 from gsmap.register.scale_selection import refine_and_select_scale
 from gsmap.register.scene_view import SceneView
 from gsmap.register.timing import Stopwatch
@@ -23,6 +24,7 @@ from gsmap.types.registration import Proposal
 # Share of the proposed pose's inliers that must be inliers of the refined pose, too; with fewer the proposed pose is
 # evaluated instead.
 _MIN_EXPLAINED = 0.5
+_MIN_ODDS = 0.5  # of the most probable pose, from which poses elsewhere are compared with it
 
 
 def register_pair(
@@ -57,8 +59,11 @@ def register_pair(
         if any(not j.flaw for j in evaluated):
             break
     evaluated += _rivals(evaluated, tried, target, source, params, watch)
+    evaluated, elsewhere = _compare_elsewhere(evaluated, target, source, params, watch)
     report(1.0, "done")
-    found = select_pose(target, source, evaluated, params, seconds=watch.seconds, notes=proposing.notes)
+    found = select_pose(
+        target, source, evaluated, params, seconds=watch.seconds, notes=proposing.notes, elsewhere=elsewhere
+    )
     same = find_duplicate(target, source, found)
     return replace(found, notes=(*found.notes, same)) if same else found
 
@@ -114,6 +119,44 @@ def _rivals(
             break
         known += [rival.S_target_source, found[-1].proposal.S_target_source]
     return found
+
+
+def _compare_elsewhere(
+    evaluated: list[EvaluatedPose], target: SceneView, source: SceneView, params: Params, watch: Stopwatch
+) -> tuple[list[EvaluatedPose], list[float]]:
+    """Compare the most probable pose with all poses elsewhere under which both surfaces are about as similar.
+
+    Returns:
+        All evaluated poses, the most similar poses elsewhere among them, with their similarities if there are any; and
+        the similarities of the other poses elsewhere, which are too many to evaluate.
+    """
+    best = max((j for j in evaluated if not contradiction_of(j, params)), key=odds_of, default=None)
+    if best is None or odds_of(best) < _MIN_ODDS:
+        return evaluated, []
+    up = target.graph.up
+    if up is None and source.graph.up is not None:
+        up = best.proposal.S_target_source.rotation @ source.graph.up
+    if up is None:
+        return evaluated, []
+    pair, centre, unit_m = MetricPair.of(target, source, best.proposal, params), source.centre, own_working_m(target)
+    with watch.step("verdict"):
+        pose = pair.to_metres(best.proposal.S_target_source)
+        repetition = Repetition(pair.target.surface(), pair.source.surface(), pose, up)
+        elsewhere = repetition.elsewhere()
+    left, known = list[tuple[Sim3, float]](), [j.proposal.S_target_source for j in evaluated]
+    for S, similarity in ((pair.to_scene_units(S), similarity) for S, similarity in elsewhere):
+        if not any(is_same_pose(S, other, centre, unit_m) for other in known):
+            left.append((S, similarity))
+            known.append(S)
+    # In a place that repeats, correspondences favour no period: each counts as much as the most probable pose.
+    proposals = [replace(best.proposal, S_target_source=S, support=None) for S, _ in left[: params.max_poses]]
+    evaluated = [*evaluated, *(_evaluate(proposal, target, source, params, watch) for proposal in proposals)]
+    if len(evaluated) == 1:
+        return evaluated, []
+    with watch.step("verdict"):
+        poses = [pair.to_metres(j.proposal.S_target_source) for j in evaluated]
+        compared = [replace(j, similarity=repetition.similarity(S)) for j, S in zip(evaluated, poses, strict=True)]
+    return compared, [similarity for _, similarity in left[params.max_poses :]]
 
 
 def _evaluate(

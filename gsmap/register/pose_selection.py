@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmap.geometry.rotations import angle_between
-from gsmap.reason_codes import reason
+from gsmap.reason_codes import reason, reason_code
 from gsmap.register import verdict
 from gsmap.register.evidence import PoseEvidence
 from gsmap.register.metric_scene import own_working_m
 from gsmap.register.params import Params
 from gsmap.register.probability import probability
 from gsmap.register.proposal_rounds import num_nodes
+from gsmap.register.repetition import MARGIN, fisher_z
 from gsmap.register.scene_view import SceneView
 from gsmap.register.unit_scale import ScaleDecision
 from gsmap.types import Registration, Sim3
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 SAME_ROTATION_DEG = 3.0
 SAME_DISTANCE_M = 0.3  # moved by the centre of the source's content
 SAME_LOG_SCALE = 0.02
+_RENDERS_SIGMA = 0.1  # at this standard deviation the colours of renders count half as much as those of cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,8 @@ class EvaluatedPose:
         flaw: reason why the pose is not accepted; empty if it is.
         decision: decision on the scale; None if it was not measured, or if the unit of a scene is unknown.
         strain: change of shape that would align the source; None if a similarity aligns it.
+        similarity: similarity of both surfaces under the pose (`gsmap.register.repetition`); NaN if it is not known or
+            no other pose is possible.
     """
 
     proposal: Proposal
@@ -49,6 +53,7 @@ class EvaluatedPose:
     flaw: str
     decision: ScaleDecision | None = None
     strain: Strain | None = None
+    similarity: float = float("nan")
 
 
 def select_pose(
@@ -59,8 +64,13 @@ def select_pose(
     *,
     seconds: dict[str, float],
     notes: Sequence[str] = (),
+    elsewhere: Sequence[float] = (),
 ) -> Registration:
-    """Return the accepted pose, or the best pose with the evidence against it, or the reason why no pose was found."""
+    """Return the accepted pose, or the best pose with the evidence against it, or the reason why no pose was found.
+
+    Args:
+        elsewhere: similarities under poses that were not evaluated (`EvaluatedPose.similarity`).
+    """
     common: dict[str, Any] = {"target": target.id, "source": source.id, "seconds": seconds}
     if not evaluated:
         fewest = num_nodes(target, source)
@@ -70,18 +80,22 @@ def select_pose(
         )
         return Registration(status="no_match", reason=why, notes=tuple(notes), **common)
     accepted = [j for j in evaluated if not j.flaw]
-    best = accepted[0] if accepted else min(evaluated, key=_sort_key)
+    best = _most_similar(accepted) if accepted else min(evaluated, key=_sort_key)
     status, why = ("accepted", "") if accepted else ("rejected", best.flaw)
     # A pose that is too uncertain to become an edge still counts as a rival.
-    others = [j for j in evaluated if not verdict.contradiction(j.proposal, j.evidence, params.verdict)]
-    others = [j for j in others if not _same(best, j, target, source)]
-    rivals = [j for j in others if verdict.is_acceptable(j.proposal, j.evidence, params.verdict)]
-    probable = _probability_among(best, others)
+    others = [j for j in evaluated if not _same(best, j, target, source) and _may_be_correct(j, best, params)]
+    as_similar = [j for j in others if np.isfinite(j.similarity - best.similarity)]
+    num_as_similar = len(as_similar) + sum(not similarity < best.similarity - MARGIN for similarity in elsewhere)
+    others = [j for j in others if j not in as_similar]
+    probable = _probability_among(best, others, num_as_similar)
+    rivals = as_similar or [j for j in others if verdict.is_acceptable(j.proposal, j.evidence, params.verdict)]
     if probable < params.verdict.min_probability:
-        rivals = rivals or sorted(others, key=lambda j: -_odds_of(j))
-    if accepted and rivals:
-        apart = _describe_distance(best, rivals[0], target, source)
+        rivals = rivals or sorted(others, key=lambda j: -odds_of(j))
+    if accepted and (rivals or num_as_similar):
         status = "no_match"
+        apart = (
+            _describe_distance(best, rivals[0], target, source) if rivals else f"{num_as_similar} poses agree as well"
+        )
         why = reason("ambiguous", f"ambiguous: {apart}, and the first is correct with a probability of {probable:.0%}")
     elif not accepted and not verdict.has_low_nfa(best.proposal, params.verdict):
         status, why = "no_match", verdict.not_significant(best.proposal, params.verdict, best.flaw)
@@ -136,16 +150,53 @@ def _describe_distance(a: EvaluatedPose, b: EvaluatedPose, target: SceneView, so
     return f"two poses lie {degrees:.0f} deg and {metres:.1f} m apart"
 
 
-def _odds_of(evaluated: EvaluatedPose) -> float:
+def contradiction_of(evaluated: EvaluatedPose, params: Params) -> str:
+    """Return the evidence that alone rules out a pose; empty if there is none."""
+    return verdict.contradiction(evaluated.proposal, evaluated.evidence, params.verdict)
+
+
+def _may_be_correct(evaluated: EvaluatedPose, best: EvaluatedPose, params: Params) -> bool:
+    """Return whether a pose may be correct in place of the best pose. Where the surfaces are about as similar under it,
+    renders whose colours agree little do not rule it out."""
+    lead = _lead(best, evaluated)
+    if lead > MARGIN:
+        return False
+    against = contradiction_of(evaluated, params)
+    return not against or bool(np.isfinite(lead) and reason_code(against) == "colours_disagree")
+
+
+def _lead(a: EvaluatedPose, b: EvaluatedPose) -> float:
+    """Return by how much the surfaces are more similar under pose a than under b; NaN if that is not known.
+
+    Colours of renders count by their significance: in a small room few patches are compared.
+    """
+    (one, sigma), (other, sigma_other) = (_similarity_of_renders(j.evidence) for j in (a, b))
+    weight = 1.0 / (1.0 + (sigma**2 + sigma_other**2) / _RENDERS_SIGMA**2)
+    return a.similarity - b.similarity + weight * (one - other)
+
+
+def _similarity_of_renders(evidence: PoseEvidence) -> tuple[float, float]:
+    """Return `fisher_z` of the colour correlation of renders, and its standard deviation."""
+    r = evidence.colour_correlation
+    return fisher_z(r), abs(r) / max(abs(evidence.colour_t), 1e-3) / max(1.0 - r**2, 1e-3)
+
+
+def _most_similar(accepted: Sequence[EvaluatedPose]) -> EvaluatedPose:
+    """Return the accepted pose under which the surfaces are most similar; the first one if that is not known."""
+    return max(accepted, key=lambda j: np.nan_to_num(j.similarity, nan=-np.inf))
+
+
+def odds_of(evaluated: EvaluatedPose) -> float:
     """Return the odds that a pose is correct, by its own evidence."""
     p = probability(evaluated.proposal, evaluated.evidence, verdict.PRIOR)
     return p / (1.0 - p)
 
 
-def _probability_among(best: EvaluatedPose, others: Sequence[EvaluatedPose]) -> float:
-    """Return the probability that a pose is correct, if at most one of all evaluated poses is."""
-    odds = _odds_of(best)
-    return odds / (1.0 + odds + sum(_odds_of(j) for j in others))
+def _probability_among(best: EvaluatedPose, others: Sequence[EvaluatedPose], num_equal: int) -> float:
+    """Return the probability that a pose is correct, if at most one of all poses is: itself, some others, and a number
+    of poses that are as probable as it is."""
+    odds = odds_of(best)
+    return odds / (1.0 + (1 + num_equal) * odds + sum(odds_of(j) for j in others))
 
 
 def _evidence_figures(evaluated: EvaluatedPose, probable: float) -> dict[str, float]:

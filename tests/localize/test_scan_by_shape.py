@@ -12,7 +12,8 @@ import pytest
 from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.rotations import angle_between
 from gsmap.localize.scan import as_gaussians
-from gsmap.register import SceneView, by_shape, register_by_shape
+from gsmap.register import SceneView, by_shape
+from gsmap.register.by_shape import register_by_shape
 from gsmap.register.evidence import PoseEvidence
 from gsmap.types import NodeLayer, SceneGraph, Sim3
 from gsmap.types.registration import Proposal

@@ -166,3 +166,27 @@ def test_the_scale_is_stored_as_decided_or_as_the_covariance_has_it() -> None:
     found = select(replace(pose, decision=decided)).evidence
     assert (found["log_scale"], found["log_scale_sigma"]) == (0.2, 0.003)
     assert np.isnan(select(replace(pose, covariance=None, flaw="free-space violation 40%")).evidence["log_scale"])
+
+
+@pytest.mark.guards("answers")
+def test_a_pose_is_told_from_its_repetitions_by_similarity_alone() -> None:
+    def similar(metres: float, similarity: float, flaw: str = "") -> EvaluatedPose:
+        return replace(evaluated(shifted(metres), flaw), similarity=similarity)
+
+    # The most similar pose is the result, whichever was proposed first, if it is told from all others.
+    told = select(similar(3, 0.45), similar(0, 0.9))
+    assert told.status == "accepted"
+    assert told.S_target_source is not None
+    assert told.S_target_source.translation[0] == 0
+    for rivals in ([similar(3, 0.7)], [similar(3, 0.7, "improbable")], [replace(similar(3, 0.6), similarity=np.nan)]):
+        assert select(*rivals, similar(0, 0.9)).reason_code == "ambiguous"
+    # Colours of renders count by their significance.
+    for t, status in ((400.0, "accepted"), (2.0, "no_match")):
+        pale = replace(SURE, colour_correlation=0.8, colour_t=t)
+        rival = replace(evaluated(shifted(3), evidence=pale), similarity=0.8)
+        bright = replace(evaluated(shifted(0), evidence=replace(SURE, colour_t=t)), similarity=0.9)
+        assert select(rival, bright).status == status
+    # Poses that were not evaluated count, too.
+    source = SimpleNamespace(**vars(SCENE) | {"id": "b"})
+    for elsewhere, status in (([0.59], "accepted"), ([0.61], "no_match"), ([1.5], "no_match")):
+        assert select_pose(SCENE, source, [similar(0, 0.9)], Params(), seconds={}, elsewhere=elsewhere).status == status

@@ -29,6 +29,7 @@ from gsmap.map.stages.register import placed_scenes
 from gsmap.methods import RecipeKey
 from gsmap.reason_codes import reason, reason_code
 from gsmap.register import SceneView
+from gsmap.register.by_shape import register_by_shape
 from gsmap.register.pose_selection import SAME_DISTANCE_M, SAME_LOG_SCALE, SAME_ROTATION_DEG
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, PoseGraph, Registration, Scene
@@ -134,7 +135,7 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
         if sought.coloured:
             found.append(register.register_pair(target, source, settings.register))
         else:
-            found.append(register.register_by_shape(target, source, settings.register))
+            found.append(register_by_shape(target, source, settings.register))
         if found[-1].status == "accepted":
             supports.append(ScanPose.from_registration(poses.poses[scene], found[-1]))
     told(1.0, "done")

@@ -1,0 +1,204 @@
+"""Find where else a source agrees with a target in shape and colour about as well as under a given pose.
+
+In a corridor, a colonnade or a parking deck, and along a façade, a pose that is one period off agrees nearly
+everywhere; in a symmetric room, so does a pose that is turned. The nodes of the scene graphs propose some of these
+poses, never all. Therefore the surfaces are correlated over all horizontal shifts, at every quarter turn about the
+vertical, by fast Fourier transforms of grids of cells.
+
+The constants were chosen on synthetic halls and façades (`tools.bench.repetitive`, seeds 101 to 104).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.geometry.directions import level_frame
+from gsmap.register.surface import Surface
+from gsmap.types import Sim3
+
+_CELL_M = np.array([0.2, 0.2, 0.4])  # cells are taller than wide, as levels stay where they are;
+_MAX_CELLS = 4_000_000  # of the box of a surface: cells are doubled until it has no more
+_BLUR_CELLS = 0.7  # so that shifts by a fraction of a cell matter little
+_AROUND = (3, 5, 5)  # cells (z, x, y) over which the mean colour is subtracted
+_MIN_CELLS = 150  # fewer common cells correlate by chance,
+_MIN_SHARE = 0.25  # and so do fewer than this share of those under the given pose
+MARGIN = 0.3
+"""A pose is told from another if the surfaces are more similar under it by this much (`fisher_z`)."""
+_MOST = 0.98  # correlations count up to this
+_PARTS = np.array([[0, 0, 0], [0.5, 0, 0], [0, 0.5, 0], [0.5, 0.5, 0]])  # of a cell by which the cells are offset
+_MAX_PEAKS = 50  # at each quarter turn
+_PEAK_CELLS = 7  # width within which only the highest correlation counts
+_REFINEMENT = 0.2  # by which the similarity may rise when a pose is refined
+_MAX_LOSS = 0.2  # of correlation between the cells, at most
+_DISTANCE_M = 1.0  # nearer poses are refined to the given one
+_OPPONENT = np.array([[0.299, 0.587, 0.114], [1.0, -1.0, 0.0], [0.5, 0.5, -1.0]]).T  # lightness and two chromas
+
+
+class Repetition:
+    """The colours of two surfaces, compared under poses near and far from a given one.
+
+    Args:
+        target, source: surfaces in metres; ``pose`` (target from source) as well.
+        up: (3,) direction against gravity in the target's frame.
+    """
+
+    def __init__(self, target: Surface, source: Surface, pose: Sim3, up: np.ndarray) -> None:
+        self._source, self._pose = source, pose
+        self._level = Sim3(level_frame(up), np.zeros(3))
+        self._points, self._moved = self._level.apply(target.coarse[0]), (self._level @ pose).apply(source.coarse[0])
+        self._colours = target.coarse[1], source.coarse[1]
+        self._cell_m = _CELL_M
+        sizes = [np.ptp(points, axis=0) if len(points) else 0.0 for points in (self._points, self._moved)]
+        while max(np.prod(size / self._cell_m + 1) for size in sizes) > _MAX_CELLS:
+            self._cell_m = 2 * self._cell_m
+
+    def similarity(self, pose: Sim3) -> float:
+        """Return how similar both surfaces are under a pose: `fisher_z` of the correlation of their colours, averaged
+        over positions of the cells; NaN where they have too little in common.
+        """
+        moved = (self._level @ pose).apply(self._source.coarse[0])
+        return fisher_z(float(np.mean([self._correlation(moved, part * self._cell_m) for part in _PARTS])))
+
+    def _correlation(self, moved: np.ndarray, offset: np.ndarray) -> float:
+        """Return the correlation with the moved points of the source in cells that are offset, or NaN."""
+        grids = [
+            _Grid.of(points + offset, colours, self._cell_m)
+            for points, colours in zip((self._points, moved), self._colours, strict=True)
+        ]
+        low, high = np.maximum(*(grid.low for grid in grids)), np.minimum(*(grid.high for grid in grids))
+        if (high <= low).any():
+            return float("nan")
+        parts = []
+        for grid in grids:
+            x, y, z = (slice(f, t) for f, t in zip(low - grid.low, high - grid.low, strict=True))
+            parts.append((grid.occupied[z, x, y] > 0, grid.contrast[:, z, x, y]))
+        common = parts[0][0] & parts[1][0]
+        if common.sum() < _MIN_CELLS:
+            return float("nan")
+        a, b = (contrast[:, common] for _, contrast in parts)
+        return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum() + 1e-9))
+
+    def elsewhere(self) -> list[tuple[Sim3, float]]:
+        """Return poses far from the given one under which the surfaces may be about as similar, or more so, once they
+        are refined, with the similarities now; the most similar first.
+        """
+        from scipy.ndimage import maximum_filter
+
+        own = fisher_z(self._correlation(self._moved, np.zeros(3)))
+        if not np.isfinite(own):
+            return []
+        grid = _Grid.of(self._points, self._colours[0], self._cell_m)
+        found, centre, enough = list[tuple[Sim3, float]](), np.median(self._moved, axis=0), 0.0
+        least = own - MARGIN - _REFINEMENT
+        for quarter in range(4):
+            turn = _quarter_turn(quarter, centre)
+            other = _Grid.of(turn.apply(self._moved), self._colours[1], self._cell_m)
+            correlation, count = _correlate(grid, other)
+            extent, first = np.array(other.occupied.shape[1:]), (other.low - grid.low)[:2]
+            if quarter == 0:
+                enough = max(_MIN_SHARE * count[tuple(first % count.shape)], _MIN_CELLS)
+            correlation[count < enough] = 0.0
+            is_peak = correlation == maximum_filter(correlation, _PEAK_CELLS, mode="wrap")
+            peaks = np.argwhere(is_peak & (correlation > np.tanh(least) - _MAX_LOSS))
+            for at in peaks[np.argsort(-correlation[tuple(peaks.T)], kind="stable")[:_MAX_PEAKS]]:
+                peak, part = _interpolated(correlation, at)
+                shift = np.append(((at + extent) % count.shape - extent - first + part) * self._cell_m[:2], 0.0)
+                if fisher_z(peak) >= least and (quarter or np.linalg.norm(shift) > _DISTANCE_M):
+                    S = self._level.inverse() @ Sim3(turn.rotation, turn.translation + shift) @ self._level @ self._pose
+                    found.append((S, fisher_z(peak)))
+        return sorted(found, key=lambda one: -one[1])
+
+
+def _interpolated(values: np.ndarray, at: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the height of a peak (X, Y) between the cells, by a parabola along each axis, and its (2,) offset in cells
+    from the cell ``at``."""
+    height, offset = float(values[tuple(at)]), np.zeros(2)
+    for axis in range(2):
+        step = np.eye(2, dtype=np.int64)[axis]
+        before, after = (float(values[tuple((at + side * step) % values.shape)]) for side in (-1, 1))
+        bend = before - 2 * values[tuple(at)] + after
+        if bend < 0:
+            offset[axis] = np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
+            height -= 0.25 * (before - after) * offset[axis]
+    return height, offset
+
+
+def fisher_z(correlation: float) -> float:
+    """Return Fisher's transform of a correlation, whose differences are about equally significant everywhere."""
+    return float(np.arctanh(np.clip(correlation, -_MOST, _MOST)))
+
+
+def _quarter_turn(quarter: int, centre: np.ndarray) -> Sim3:
+    """Return the rotation by a number of quarter turns about the vertical through a point."""
+    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
+    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return Sim3(rotation, centre - rotation @ centre)
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Cells of a surface.
+
+    Args:
+        low: (3,) integer coordinates of the first cell: x, y, z.
+        occupied: (Z, X, Y) float32, 1 where a cell holds surface.
+        contrast: (3, Z, X, Y) float32 difference of the mean colour of a cell from that around it, 0 where it is empty.
+    """
+
+    low: np.ndarray
+    occupied: np.ndarray
+    contrast: np.ndarray
+
+    @property
+    def high(self) -> np.ndarray:
+        """(3,) integer coordinates after the last cell."""
+        high: np.ndarray = self.low + np.array(self.occupied.shape)[[1, 2, 0]]
+        return high
+
+    @classmethod
+    def of(cls, points: np.ndarray, colours: np.ndarray, cell_m: np.ndarray) -> _Grid:
+        from scipy.ndimage import gaussian_filter, uniform_filter
+
+        if not len(points):
+            return cls(np.zeros(3, np.int64), np.zeros((1, 1, 1), np.float32), np.zeros((3, 1, 1, 1), np.float32))
+        cells = np.floor(points / cell_m).astype(np.int64)
+        low = cells.min(0)
+        x, y, z = (cells - low).T
+        shape = int(z.max()) + 1, int(x.max()) + 1, int(y.max()) + 1
+        flat, size = (z * shape[1] + x) * shape[2] + y, int(np.prod(shape))
+        count = np.bincount(flat, minlength=size)
+        occupied = (count > 0).astype(np.float32).reshape(shape)
+        blur = (0.0, _BLUR_CELLS, _BLUR_CELLS)
+        weight = np.maximum(
+            gaussian_filter(count.astype(np.float32).reshape(shape), blur, mode="constant"), np.float32(1e-6)
+        )
+        around = np.maximum(uniform_filter(occupied, _AROUND, mode="constant"), np.float32(1e-6))
+        contrast = np.empty((3, *shape), np.float32)
+        for channel, values in zip(contrast, (colours @ _OPPONENT).T, strict=True):
+            sums = np.bincount(flat, values, size).astype(np.float32).reshape(shape)
+            channel[:] = gaussian_filter(sums, blur, mode="constant") / weight * occupied
+            channel -= uniform_filter(channel, _AROUND, mode="constant") / around
+            channel *= occupied
+        return cls(low, occupied, contrast)
+
+
+def _correlate(target: _Grid, source: _Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Return, for every horizontal shift between the first cells of source and target, the (X, Y) correlation
+    of contrasts over the cells that are occupied in both grids, and the (X, Y) number of these; negative shifts are
+    counted from the end."""
+    from scipy.fft import irfft2, next_fast_len, rfft2
+
+    shapes = target.occupied.shape[1:], source.occupied.shape[1:]
+    size = [next_fast_len(a + b, real=True) for a, b in zip(*shapes, strict=True)]
+    sums = np.zeros((4, size[0], size[1] // 2 + 1), np.complex64)
+    for level in range(max(target.low[2], source.low[2]), min(target.high[2], source.high[2])):
+        spectra = []
+        for grid in (target, source):
+            occupied, contrast = grid.occupied[level - grid.low[2]], grid.contrast[:, level - grid.low[2]]
+            spectra.append(rfft2(np.stack([occupied, (contrast**2).sum(0), *contrast]), s=size))
+        a, b = spectra[0], spectra[1].conj()
+        sums += np.stack([(a[2:] * b[2:]).sum(0), a[1] * b[0], a[0] * b[1], a[0] * b[0]])
+    products, squares_t, squares_s, count = irfft2(sums, s=size)
+    return products / np.sqrt(squares_t.clip(0) * squares_s.clip(0) + 1e-9), count
