@@ -7,16 +7,17 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from gsmap.errors import CorruptError, InputError
+from gsmap.errors import CorruptError, InputError, StoreError
 from gsmap.geometry.metric_scale import in_metres, scale_gaussians
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
-from gsmap.methods import family
+from gsmap.methods import RecipeKey, family
 from gsmap.store import Store, branches, remote_map, sqlite
 from gsmap.store.photos import StoredPhoto
+from gsmap.store.results import ArrayResults, StagedResult
 from gsmap.types import (
     Cameras,
     ChangeReport,
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
     from gsmap.merge.reference_view_cache import ReferenceViewCache
     from gsmap.register import SceneView
     from gsmap.types.merging import UnchangedPlace
+
+Result = TypeVar("Result")
 
 _MAX_PIXELS = 1 << 24  # of a kept photo: so few bytes can claim any number
 
@@ -99,44 +102,87 @@ def load_view(store: Store, scene_id: str, graph_key: str) -> SceneView:
     return SceneView(scene_id, scenes.unread(scene_id), scenes.cameras(scene_id), graph, policy, prepared)
 
 
+def staged(results: ArrayResults[Result], found: Result, key: RecipeKey, inbox: str) -> Result | StagedResult:
+    """Stage the arrays of a result for the calling process, which then saves them by a row alone.
+
+    Args:
+        inbox: inbox of the calling process.
+
+    Returns:
+        The result itself where this process cannot write to the map: the calling process stores its arrays.
+    """
+    try:
+        return results.stage(found, key, inbox)
+    except (OSError, StoreError):
+        return found
+
+
 def describe_scene(
-    path: str, scene_id: str, models: Mapping[str, ModelSpec], params: describing.Params
-) -> tuple[SceneGraph, PreparedScene]:
-    """Build the scene graph of one scene of the map at ``path`` (`Store.location`), and prepare its registration."""
+    path: str, scene_id: str, models: Mapping[str, ModelSpec], params: describing.Params, key: RecipeKey, inbox: str
+) -> tuple[SceneGraph | StagedResult, PreparedScene | StagedResult]:
+    """Build the scene graph of one scene of the map at ``path`` (`Store.location`), and prepare its registration.
+
+    Args:
+        key: recipe of the graph.
+        inbox: see `staged`.
+    """
     from gsmap import describe as describing
     from gsmap.geometry.threads import run_aside
     from gsmap.register.prepare import prepare
+    from gsmap.register.recipe import prepared_key
 
-    scenes = _store(path).scenes
+    store = _store(path)
+    scenes = store.scenes
     policy = scenes.get(scene_id).scale_policy
     gaussians, cameras = scenes.unread(scene_id).degree_0(), scenes.cameras(scene_id)
     basis = describing.find_basis(gaussians, cameras, params, scale_policy=policy)
     with run_aside(lambda: prepare(scene_id, gaussians, cameras, basis.registration_m)) as prepared:
         graph = describing.describe(scene_id, gaussians, cameras, params, models, scale_policy=policy, basis=basis)
-        return graph, prepared()
+        own_key = prepared_key().of(scene_id, key.digest)
+        return staged(store.graphs, graph, key, inbox), staged(store.prepared_scenes, prepared(), own_key, inbox)
 
 
-def prepare_scene(path: str, scene_id: str, graph_key: str) -> PreparedScene:
-    """Prepare a scene of the map at ``path`` that was described by an older release."""
+def prepare_scene(path: str, scene_id: str, key: RecipeKey, inbox: str) -> PreparedScene | StagedResult:
+    """Prepare a scene of the map at ``path`` that was described by an older release.
+
+    Args:
+        key: recipe of the prepared scene, of which the key of the graph is an input.
+        inbox: see `staged`.
+    """
     from gsmap.register.prepare import prepare, working_m_of
 
     store = _store(path)
-    graph, scenes = store.graphs.load(scene_id, graph_key), store.scenes
+    graph, scenes = store.graphs.load(scene_id, key.inputs[1]), store.scenes
     assert graph is not None, f"scene {scene_id} was to be prepared before it was described"
     gaussians, cameras = scenes.unread(scene_id).degree_0(), scenes.cameras(scene_id)
-    return prepare(scene_id, gaussians, cameras, working_m_of(graph, scenes.get(scene_id).scale_policy))
+    found = prepare(scene_id, gaussians, cameras, working_m_of(graph, scenes.get(scene_id).scale_policy))
+    return staged(store.prepared_scenes, found, key, inbox)
 
 
 def features_of_scene(
-    path: str, scene_id: str, models: Mapping[str, ModelSpec], params: localizing.Params
-) -> SceneFeatures:
-    """Extract the features of the views of one scene of the map at ``path``."""
+    path: str,
+    scene_id: str,
+    models: Mapping[str, ModelSpec],
+    params: localizing.Params,
+    key: RecipeKey,
+    inbox: str | None,
+) -> SceneFeatures | StagedResult:
+    """Extract the features of the views of one scene of the map at ``path``.
+
+    Args:
+        key: recipe of the features.
+        inbox: see `staged`; None for features that are not stored.
+    """
     from gsmap import localize as localizing
 
-    scenes = _store(path).scenes
+    store = _store(path)
+    scenes = store.scenes
     extractor = family("extractor").get(params.extractor).make(models, params.extractors[params.extractor])
     gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
-    return localizing.scene_features(scene_id, gaussians, cameras, extractor, params.views)
+    found = localizing.scene_features(scene_id, gaussians, cameras, extractor, params.views)
+    if inbox is None:
+        return found
+    return staged(store.view_features, found, key, inbox)
 
 
 def register_scenes(

@@ -25,6 +25,8 @@ _WORTH_S = 1.0
 process while another is idle; quick jobs a few at a time, so that leases cost little.
 """
 _AT_MOST = 16
+_PER_LEASED = 8
+"""Number of leased jobs per job that is leased with the next: many workers need their next jobs soon."""
 
 TOGETHER_S = 1.0
 """Seconds within which results of quick jobs are stored in one transaction, as each transaction costs a dozen
@@ -182,7 +184,7 @@ class SharedJobs:
             taken = self._leases.acquire(
                 [self._lease(key) for key in self._todo],
                 self._stage,
-                limit=min(max(worth, 1), _AT_MOST),
+                limit=min(max(worth, len(self._ours) // _PER_LEASED, 1), _AT_MOST),
                 done=done,
                 give_back=[self._lease(key) for key in self._saved],
             )

@@ -38,7 +38,7 @@ from gsmap.durable import (
 from gsmap.errors import CorruptError, StoreError
 from gsmap.store import array_archive, layout
 from gsmap.store.column_types import is_array_kind, is_digest
-from gsmap.store.error_translation import display_name, translate_errors
+from gsmap.store.error_translation import NOT_KEPT, display_name, translate_errors
 from gsmap.store.layout import CHUNK_ROWS
 
 _PIECE_BYTES = 1 << 20
@@ -56,7 +56,12 @@ class StoredFile:
 
 @dataclass(frozen=True)
 class StagedGroup:
-    """A group that is complete on disk but not yet at its final path."""
+    """A group that is complete on disk but not yet at its final path.
+
+    Args:
+        folder: where its files lie; empty for objects, which have their final names already.
+        files: its manifest.
+    """
 
     folder: Path
     files: tuple[StoredFile, ...]
@@ -76,6 +81,7 @@ class Arrays:
         self.url = str(root)
         self.staging = root / "staging"
         self._held = threading.local()
+        self._inboxes: set[str] = set()
 
     @contextlib.contextmanager
     def stage(
@@ -86,15 +92,65 @@ class Arrays:
         Args:
             kind, name: kind and id of the group.
         """
-        with self._lock_staging():
-            folder = self.staging / uuid.uuid4().hex
-            try:
+        with self.scratch() as folder:
+            yield _write(folder, arrays)
+
+    @contextlib.contextmanager
+    def inbox(self) -> Iterator[str]:
+        """Open an inbox: a folder in the staging area, into which other processes stage groups (`stage_into`) for this
+        process to publish. Yield its name; delete it, with the groups that were not published, when the block ends.
+        """
+        with contextlib.ExitStack() as until_end:
+            with translate_errors(self.root.parent, NOT_KEPT):
+                folder = until_end.enter_context(self.scratch())
                 folder.mkdir()
-                array_archive.write(folder / array_archive.FILE, arrays, chunk_rows=CHUNK_ROWS)
-                yield StagedGroup(folder, _synchronise(folder))
+            self._inboxes.add(folder.name)
+            try:
+                yield folder.name
             finally:
-                with contextlib.suppress(OSError):  # a published folder is no longer here
-                    self._remove_staged(folder.name)
+                self._inboxes.discard(folder.name)
+
+    def stage_into(
+        self, inbox: str, arrays: Mapping[str, np.ndarray | array_archive.StreamedArray], kind: str, name: str
+    ) -> StagedGroup:
+        """Stage arrays in an inbox, whose process publishes or deletes them.
+
+        Args:
+            inbox: name of an open inbox of any process (`inbox`).
+            kind, name: kind and id of the group.
+
+        Raises:
+            OSError: the inbox was closed, or this process cannot write to it.
+        """
+        with self._lock_staging():
+            refuse_links(self.staging, inbox)
+            folder = self.staging / inbox / uuid.uuid4().hex
+            try:
+                return _write(folder, arrays)
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    self._remove_staged(inbox, folder.name)
+                raise
+
+    def received(self, staged: StagedGroup, kind: str, name: str) -> StagedGroup:
+        """Return a group that another process staged, after checking that it is in an open inbox of this process and
+        has the files of its manifest.
+
+        Args:
+            kind, name: kind and id of the group.
+
+        Raises:
+            StoreError: it is not, or has not.
+        """
+        inbox, own = staged.folder.parent.name, staged.folder.name
+        if inbox in self._inboxes and is_digest(own) and [file.path for file in staged.files] == [array_archive.FILE]:
+            self._check_root()
+            refuse_links(self.root, self.staging.name, inbox, own)
+            folder = self.staging / inbox / own
+            found = [(path, one.st_size, stat.S_ISREG(one.st_mode)) for path, one in files_below(folder).items()]
+            if found == [(file.path, file.size_bytes, True) for file in staged.files]:
+                return StagedGroup(folder, staged.files)
+        raise unknown_group(staged)
 
     @contextlib.contextmanager
     def scratch(self) -> Iterator[Path]:
@@ -104,7 +160,7 @@ class Arrays:
             try:
                 yield folder
             finally:
-                with contextlib.suppress(OSError):
+                with contextlib.suppress(OSError):  # a published folder is no longer here
                     self._remove_staged(folder.name)
 
     @contextlib.contextmanager
@@ -122,17 +178,12 @@ class Arrays:
         Raises:
             CorruptError: a file is missing, or differs from its digest.
         """
-        with self._lock_staging():
-            folder = self.staging / uuid.uuid4().hex
-            try:
-                folder.mkdir()
-                yield {
-                    group: StagedGroup(source.copy_group(*group, files, folder / "-".join(group)), tuple(files))
-                    for group, files in groups.items()
-                }
-            finally:
-                with contextlib.suppress(OSError):
-                    self._remove_staged(folder.name)
+        with self.scratch() as folder:
+            folder.mkdir()
+            yield {
+                group: StagedGroup(source.copy_group(*group, files, folder / "-".join(group)), tuple(files))
+                for group, files in groups.items()
+            }
 
     @contextlib.contextmanager
     def lock(self, patience_s: float = 120.0) -> Iterator[None]:
@@ -338,8 +389,8 @@ class Arrays:
             self.root.mkdir(exist_ok=True)  # not its parents: a map that was moved must not be begun anew
         self.staging.mkdir(exist_ok=True)
 
-    def _remove_staged(self, name: str) -> None:
-        remove_tree(self.root.parent, self.root.name, self.staging.name, name)
+    def _remove_staged(self, *names: str) -> None:
+        remove_tree(self.root.parent, self.root.name, self.staging.name, *names)
 
     def drop_leftovers(self, *, dry_run: bool = False) -> int:
         """Delete what killed writers left in the staging folder and return the bytes freed; skipped while a writer is
@@ -460,6 +511,21 @@ def _open_body(place: Path, kind: str, files: Sequence[StoredFile]) -> Iterator[
         yield layout.GroupReader(str(place), kind, {file.path: file.size_bytes for file in files}, reader)
     finally:
         reader.close()
+
+
+def unknown_group(staged: StagedGroup) -> StoreError:
+    """Return the error for a group that another process staged, but that is not there as its manifest says."""
+    return StoreError(
+        f"a worker staged arrays in {staged.folder}, but they are not there: run the same command again",
+        code="changed_meanwhile",
+    )
+
+
+def _write(folder: Path, arrays: Mapping[str, np.ndarray | array_archive.StreamedArray]) -> StagedGroup:
+    """Write arrays to a new folder and synchronize it."""
+    folder.mkdir()
+    array_archive.write(folder / array_archive.FILE, arrays, chunk_rows=CHUNK_ROWS)
+    return StagedGroup(folder, _synchronise(folder))
 
 
 def _synchronise(folder: Path) -> tuple[StoredFile, ...]:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sqlalchemy import Connection, Row, Text, true, type_coerce
 
-from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
-from gsmap.store.array_groups import manifest, num_bytes, publish, unless_pruned, unname
-from gsmap.store.arrays import Arrays, digest
+from gsmap.store.array_groups import manifest, num_bytes, unless_pruned, unname
+from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog, next_timestamp
 from gsmap.store.catalog_rows import located_graphs
-from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.store.graph_content import from_arrays, shapes_of, to_arrays
 from gsmap.store.result_rows import GRAPHS
+from gsmap.store.results import ArrayResults, PackedResult
 from gsmap.store.row_index_maps import RowIndexMaps
 from gsmap.store.scene_refs import resolve
 from gsmap.store.schema import scenes
@@ -37,6 +36,8 @@ class StoredGraph:
         unit_m: estimated metres per scene unit.
         up: (3,) direction against gravity in the scene frame, or None.
         recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`).
+        notes: remarks on it.
+        about_layers: ``descriptor_id`` and ``unit_m`` of each layer (`NodeLayer`).
     """
 
     key: str
@@ -46,62 +47,37 @@ class StoredGraph:
     unit_m: float = 1.0
     up: tuple[float, ...] | None = None
     recipe: str = ""
+    notes: tuple[str, ...] = ()
+    about_layers: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
     def num_nodes(self) -> int:
         return sum(self.layers.values())
 
 
-class Graphs:
-    """The scene graphs of a map, one per scene and recipe."""
+class Graphs(ArrayResults[SceneGraph]):
+    """The scene graphs of a map, one per scene and recipe. Saving one again repairs its damaged arrays."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
-        self._catalog = catalog
-        self._arrays = arrays
-        self._rows = RowIndexMaps(catalog, arrays)
+        super().__init__(catalog, arrays, GRAPHS, "the graph of scene")
+        self._row_maps = RowIndexMaps(catalog, arrays)
         self._listed: dict[tuple[Any, ...], StoredGraph] = {}  # by number, key, array group and time of the row
 
-    def save(self, graph: SceneGraph, key: RecipeKey) -> StoredGraph:
-        """Store a graph in place of one with the same key; saving the same graph again repairs its damaged arrays.
-
-        Args:
-            key: its recipe; the scene must be among its inputs.
-
-        Raises:
-            InputError: the scene is not among the inputs of the key.
-        """
-        if graph.scene_id not in key.inputs:
-            raise InputError(
-                f"the recipe key of a graph must have its scene {graph.scene_id} among its inputs",
-                code="key_input_mismatch",
-            )
+    def _pack(self, graph: SceneGraph) -> PackedResult:
         arrays, about = to_arrays(self._with_whole_members(graph))
-        group_id = digest(*arrays.values(), text=f"{key.digest}{about}")
-        mine = GRAPHS.has_key(key)
-        staging = self._arrays.stage(arrays, KIND, group_id)
-        with translate_errors(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
-            old = connection.execute(GRAPHS.select().where(mine)).first()
-            known = manifest(connection, group_id)
-            if not known or self._arrays.problems(KIND, group_id, known):
-                publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
-            if old is not None and old.group_id == group_id:
-                return _stored(old)
-            resolve(connection, graph.scene_id)
+        return PackedResult(graph.scene_id, graph.num_nodes, about, arrays)
+
+    def _insert(self, connection: Connection, row: Mapping[str, Any]) -> None:
+        mine = GRAPHS.has_key(row["key"])
+        old = connection.execute(GRAPHS.select().where(mine)).first()
+        if old is not None:
+            if old.group_id == row["group_id"]:
+                return
             connection.execute(GRAPHS.delete(mine))
-            if old is not None and self._is_damaged(connection, old.group_id):
+            if self._is_damaged(connection, old.group_id):
                 unname(connection, old.group_id)
-            of_scene = (GRAPHS.c.kind == KIND) & (GRAPHS.c.scene == graph.scene_id)
-            GRAPHS.insert(
-                connection,
-                key=key.digest,
-                recipe=recipes.save_recipe(connection, key),
-                scene=graph.scene_id,
-                num_items=graph.num_nodes,
-                about=about,
-                group_id=group_id,
-                created_at=next_timestamp(connection, GRAPHS.c.created_at, of_scene),
-            )
-            return _stored(connection.execute(GRAPHS.select().where(mine)).one())
+        of_scene = (GRAPHS.c.kind == KIND) & (GRAPHS.c.scene == row["scene"])
+        GRAPHS.insert(connection, **row, created_at=next_timestamp(connection, GRAPHS.c.created_at, of_scene))
 
     def find(self, key: RecipeKey | str) -> StoredGraph | None:
         """Return the record of the graph with this key or digest; None without such a graph."""
@@ -142,14 +118,14 @@ class Graphs:
         """Convert segment members to rows of the whole capture; see `gsmap.store.row_index_maps`."""
         if graph.segments is None:
             return graph
-        members = self._rows.of(graph.scene_id).values_of_whole(graph.segments.members, -1)
+        members = self._row_maps.of(graph.scene_id).values_of_whole(graph.segments.members, -1)
         return replace(graph, segments=replace(graph.segments, members=members))
 
     def _with_kept_members(self, graph: SceneGraph) -> SceneGraph:
         """Convert segment members to rows of the stored Gaussians: the inverse of `_with_whole_members`."""
         if graph.segments is None:
             return graph
-        members = self._rows.of(graph.scene_id).values_of_kept(graph.segments.members)
+        members = self._row_maps.of(graph.scene_id).values_of_kept(graph.segments.members)
         return replace(graph, segments=None if members is None else replace(graph.segments, members=members))
 
     def num_bytes(self, ref: str) -> int:
@@ -157,11 +133,6 @@ class Graphs:
         with self._catalog.read() as connection:
             made = GRAPHS.select(GRAPHS.c.group_id).where(GRAPHS.c.scene == resolve(connection, ref)).distinct()
             return sum(num_bytes(connection, group) for group in connection.execute(made).scalars())
-
-    def stored_keys(self, keys: Iterable[RecipeKey | str]) -> set[str]:
-        """Return, as digests, the keys that have a graph."""
-        with self._catalog.read() as connection:
-            return recipes.stored_keys(connection, GRAPHS.c.key, keys, GRAPHS.c.kind == KIND)
 
     def damaged(self, keys: Iterable[RecipeKey | str]) -> set[str]:
         """Return, as digests, the keys whose graph differs from its file digests; reads every byte."""
@@ -215,7 +186,15 @@ class Graphs:
 
 
 def _stored(row: Row[Any]) -> StoredGraph:
-    counts = {name: layer["count"] for name, layer in row.about["layers"].items()}
-    up = row.about["up"]
-    known_up = None if up is None else tuple(up)
-    return StoredGraph(row.key, row.scene, counts, row.created_at, float(row.about["unit_m"]), known_up, row.recipe)
+    layers = row.about["layers"]
+    return StoredGraph(
+        key=row.key,
+        scene=row.scene,
+        layers={name: layer["count"] for name, layer in layers.items()},
+        created_at=row.created_at,
+        unit_m=float(row.about["unit_m"]),
+        up=None if row.about["up"] is None else tuple(row.about["up"]),
+        recipe=row.recipe,
+        notes=tuple(row.about["notes"]),
+        about_layers={name: layer["rest"] for name, layer in layers.items()},
+    )

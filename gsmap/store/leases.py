@@ -244,7 +244,9 @@ class Leases:
         found = [Lease(*(str(getattr(row, column)) for column in columns)) for row in rows]
         # A later expiry is invalid: the clock was set back, or gsmap did not write it.
         latest = _text(now + timedelta(seconds=2 * self._lease_s))
-        holds = [_text(now) < lease.expires_at <= latest and not lease.is_gone for lease in found]
+        ended = {one.process: one.is_gone for one in {lease.process: lease for lease in found}.values()}
+        at = _text(now)
+        holds = [at < lease.expires_at <= latest and not ended[lease.process] for lease in found]
         living = [lease for lease, yes in zip(found, holds, strict=True) if yes]
         return living, [lease for lease, yes in zip(found, holds, strict=True) if not yes]
 

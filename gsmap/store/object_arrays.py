@@ -22,7 +22,7 @@ import numpy as np
 
 from gsmap.errors import CorruptError, NotFoundError, StoreError
 from gsmap.store import array_archive, cache, layout
-from gsmap.store.arrays import Arrays, StagedGroup, StoredFile, stored_file
+from gsmap.store.arrays import Arrays, StagedGroup, StoredFile, stored_file, unknown_group
 from gsmap.store.column_types import is_array_kind, is_digest
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.remote_map import RemoteMap
@@ -63,6 +63,27 @@ class ObjectArrays(Arrays):
             staged = StagedGroup(Path(folder), (stored_file(Path(folder), array_archive.FILE),))
             self._send(staged, kind, name)
             yield staged
+
+    @contextlib.contextmanager
+    def inbox(self) -> Iterator[str]:
+        yield ""  # other processes send objects to their final names
+
+    def stage_into(
+        self, inbox: str, arrays: Mapping[str, np.ndarray | array_archive.StreamedArray], kind: str, name: str
+    ) -> StagedGroup:
+        with self.stage(arrays, kind, name) as staged:
+            for file in staged.files:
+                if (key := self._key(kind, name, file)) not in self._sent and self._sha256(key) != file.sha256:
+                    self._storage.put(key, chunks_of(staged.folder / file.path), file.size_bytes)
+            return StagedGroup(Path(), staged.files)
+
+    def received(self, staged: StagedGroup, kind: str, name: str) -> StagedGroup:
+        for file in staged.files:
+            key = self._key(kind, name, file)
+            if file.path != array_archive.FILE or self._storage.size_bytes(key) != file.size_bytes:
+                raise unknown_group(staged)
+            self._sent.add(key)
+        return StagedGroup(Path(), staged.files)
 
     @contextlib.contextmanager
     def stage_copies(
@@ -110,6 +131,8 @@ class ObjectArrays(Arrays):
             if key not in self._sent:  # sent by another process
                 whole = whole and self._sha256(key) == file.sha256
             if not whole:
+                if staged.folder == Path():  # another process has the bytes
+                    raise unknown_group(staged)
                 self._storage.put(key, chunks_of(staged.folder / file.path), file.size_bytes)
             self._sent.discard(key)
 

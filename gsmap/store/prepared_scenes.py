@@ -13,7 +13,7 @@ from gsmap.methods import RecipeKey
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
 from gsmap.store.layout import Shape
-from gsmap.store.results import DerivedArrays
+from gsmap.store.results import DerivedArrays, PackedResult
 from gsmap.types import Cameras
 from gsmap.types.prepared_scene import PreparedScene
 
@@ -35,18 +35,13 @@ _TYPES: dict[str, np.dtype[Any]] = {
 }
 
 
-class PreparedScenes(DerivedArrays):
+class PreparedScenes(DerivedArrays[PreparedScene]):
     """The prepared scenes of a map."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         super().__init__(catalog, arrays, KIND, _TYPES, "the surface cells and views of scene")
 
-    def save(self, found: PreparedScene, key: RecipeKey) -> None:
-        """Store a prepared scene in place of all earlier ones of that scene.
-
-        Args:
-            key: its recipe; the scene must be among its inputs.
-        """
+    def _pack(self, found: PreparedScene) -> PackedResult:
         arrays: dict[str, np.ndarray] = {
             "centre": found.centre[None],
             "surface": np.packbits(found.is_surface),
@@ -61,16 +56,15 @@ class PreparedScenes(DerivedArrays):
             "image_colours": found.image_colours,
             "image_depths": found.image_depths,
         }
-        self.put(
-            found.scene,
-            key,
-            {name: arrays[name].astype(_TYPES[name], copy=False) for name in arrays},
-            unit_m=float(found.unit_m),
-            num_gaussians=len(found.is_surface),
-            num_items=len(found.points),
-            num_views=len(found.cameras),
-            num_own=found.num_own,
-        )
+        about = {
+            "unit_m": float(found.unit_m),
+            "num_gaussians": len(found.is_surface),
+            "num_items": len(found.points),
+            "num_views": len(found.cameras),
+            "num_own": found.num_own,
+        }
+        typed = {name: arrays[name].astype(_TYPES[name], copy=False) for name in arrays}
+        return PackedResult(found.scene, len(found.points), about, typed)
 
     def load(self, scene: str, key: RecipeKey | str) -> PreparedScene | None:
         """Load the prepared scene with this key; None without such a scene.

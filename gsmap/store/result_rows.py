@@ -36,13 +36,14 @@ class ResultRows:
         required: columns that are not null in rows of this kind.
 
     Attributes:
+        kind, is_valid: as given.
         c: columns of the table.
     """
 
     def __init__(
         self, kind: str, is_valid: Callable[[Any], bool], required: Sequence[str] = ("scene", "group_id")
     ) -> None:
-        self.kind = kind
+        self.kind, self.is_valid = kind, is_valid
         columns = result_columns(is_valid)
         for column in columns:
             if hasattr(column.type, "for_column"):

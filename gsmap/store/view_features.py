@@ -16,7 +16,7 @@ from gsmap.methods import RecipeKey
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
 from gsmap.store.layout import Shape
-from gsmap.store.results import DerivedArrays
+from gsmap.store.results import DerivedArrays, PackedResult
 from gsmap.types import Cameras
 from gsmap.types.localization import SceneFeatures
 
@@ -33,18 +33,13 @@ _ARRAYS: dict[str, np.dtype[Any]] = {
 }
 
 
-class ViewFeatures(DerivedArrays):
+class ViewFeatures(DerivedArrays[SceneFeatures]):
     """The view features of a map, one set per scene."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         super().__init__(catalog, arrays, KIND, _ARRAYS, "the features of scene")
 
-    def save(self, found: SceneFeatures, key: RecipeKey) -> None:
-        """Store the features of a scene in place of all earlier features of that scene.
-
-        Args:
-            key: its recipe; the scene must be among its inputs.
-        """
+    def _pack(self, found: SceneFeatures) -> PackedResult:
         arrays: dict[str, np.ndarray] = {
             "starts": found.starts.astype(np.int64),
             "points": found.points.astype(np.float32),
@@ -54,7 +49,8 @@ class ViewFeatures(DerivedArrays):
             "intrinsics": found.cameras.intrinsics_px,
             "sizes": found.cameras.sizes_px,
         }
-        self.put(found.scene, key, arrays, num_views=found.num_views, num_items=found.num_features)
+        about = {"num_views": found.num_views, "num_items": found.num_features}
+        return PackedResult(found.scene, found.num_features, about, arrays)
 
     def load(self, scene: str, key: RecipeKey | str) -> SceneFeatures | None:
         """Load the features of a scene with this key; None without such features.

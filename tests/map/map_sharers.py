@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.types import NodeLayer, Registration, SceneGraph, Sim3
+from gsmap.types import Cameras, NodeLayer, Registration, SceneGraph, Sim3
+from gsmap.types.prepared_scene import PreparedScene
 
 LOG, SECONDS = "SHARERS_LOG", "SHARERS_SECONDS"
 
@@ -24,7 +25,27 @@ def _note(text: str) -> None:
     time.sleep(float(os.environ[SECONDS]))
 
 
-def describe_scene(path: str, scene: str, *_: Any) -> tuple[SceneGraph, None]:
+def prepared(scene: str) -> PreparedScene:
+    """A prepared scene without surface cells and views."""
+    no_points = np.zeros((0, 3), np.float32)
+    return PreparedScene(
+        scene=scene,
+        unit_m=1.0,
+        centre=np.zeros(3),
+        is_surface=np.zeros(50, bool),
+        points=no_points,
+        colours=no_points,
+        normals=no_points,
+        sides=np.zeros(0, np.int8),
+        sample=no_points,
+        cameras=Cameras(np.zeros((0, 4, 4)), np.zeros((0, 4)), np.zeros((0, 2), np.int64)),
+        num_own=0,
+        image_colours=np.zeros((0, 3), np.uint8),
+        image_depths=np.zeros(0, np.float16),
+    )
+
+
+def describe_scene(path: str, scene: str, *_: Any) -> tuple[SceneGraph, PreparedScene]:
     _note(f"graph {scene}")
     rng = np.random.default_rng(0)
     embeddings = rng.normal(size=(4, 8)).astype(np.float32)
@@ -38,7 +59,7 @@ def describe_scene(path: str, scene: str, *_: Any) -> tuple[SceneGraph, None]:
         features=np.zeros((4, 1)),
         descriptor_id="test",
     )
-    return SceneGraph(scene, {"objects": layer}, np.array([0.0, 0, 1]), 1.0), None
+    return SceneGraph(scene, {"objects": layer}, np.array([0.0, 0, 1]), 1.0), prepared(scene)
 
 
 def register_scenes(path: str, target: tuple[str, str], source: tuple[str, str], *_: Any) -> Registration:

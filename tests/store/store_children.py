@@ -4,8 +4,9 @@ import errno
 import itertools
 import os
 import sys
+import time
 
-from store_samples import key, make_cameras, make_gaussians
+from store_samples import key, made_prepared, make_cameras, make_gaussians
 
 from gsmap.store import Store, sqlite
 from gsmap.types import PoseGraph, SceneGraph, ScenePose, Sim3
@@ -163,3 +164,43 @@ def open_often(path: str, mode: str, stop, pipe) -> None:
 def open_and_close(path: str, pipe) -> None:
     with Store.open(path) as store:
         pipe.send([scene.name for scene in store.scenes.list()])
+
+
+def stage_and_save(path: str, step: int, pipe) -> None:
+    """Describe a scene as a worker and its caller do, and die at the given change of the disk."""
+    left = [step]
+
+    def hook(event: str, arguments: tuple) -> None:
+        if changes_disk(event, arguments):
+            left[0] -= 1
+            if left[0] == 0:
+                pipe.send(f"died at {event} {arguments[0]}")
+                os._exit(9)
+
+    with Store.open(path) as store, Store.open(path, "r") as worker:
+        scene = store.scenes.list()[0].id
+        sys.addaudithook(hook)
+        with store.arrays.inbox() as inbox:
+            staged = worker.graphs.stage(SceneGraph(scene), key("describe", scene), inbox)
+            more = worker.prepared_scenes.stage(made_prepared(scene), key("register", scene), inbox)
+            with store.transaction():
+                store.graphs.save(staged, key("describe", scene))
+                store.prepared_scenes.save(more, key("register", scene))
+        left[0] = -1
+    pipe.send("through")
+
+
+def stage_for(path: str, scene: str, inbox: str, pipe) -> None:
+    """Stage a graph in the inbox of another process, and end without saying so."""
+    with Store.open(path, "r") as worker:
+        pipe.send(worker.graphs.stage(SceneGraph(scene), key("describe", scene), inbox).staged.folder.name)
+    os._exit(9)
+
+
+def hold_inbox(path: str, pipe) -> None:
+    """Stage a graph for this process, and wait to be killed."""
+    with Store.open(path) as store, store.arrays.inbox() as inbox:
+        scene = store.scenes.list()[0].id
+        store.graphs.stage(SceneGraph(scene), key("describe", scene), inbox)
+        pipe.send(inbox)
+        time.sleep(600)

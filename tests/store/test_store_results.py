@@ -15,21 +15,25 @@ from gsmap.store import Store, merging, purging
 from gsmap.store.backup import restoring
 from gsmap.store.column_types import is_object_set
 from gsmap.store.result_rows import ResultRows
-from gsmap.store.results import DerivedArrays
+from gsmap.store.results import DerivedArrays, PackedResult
 from gsmap.store.schema import results
 from gsmap.store.sizes import sizes
 from gsmap.types import Scene, SceneGraph
 
 
-class MeanColours(DerivedArrays):
+class MeanColours(DerivedArrays[tuple[str, np.ndarray]]):
     """The mean colour of each scene."""
 
     def __init__(self, store: Store) -> None:
         types = {"mean": np.dtype(np.float64)}
         super().__init__(store.catalog, store.arrays, "colours", types, "the mean colour of scene")
 
-    def save(self, scene: str, mean: np.ndarray) -> None:
-        self.put(scene, key("colours", scene), {"mean": mean[None]}, num_items=1)
+    def _pack(self, found: tuple[str, np.ndarray]) -> PackedResult:
+        scene, mean = found
+        return PackedResult(scene, 1, {"num_items": 1}, {"mean": mean[None]})
+
+    def add(self, scene: str, mean: np.ndarray) -> None:
+        self.save((scene, mean), key("colours", scene))
 
     def load(self, scene: str) -> np.ndarray | None:
         return self.get(
@@ -46,7 +50,7 @@ GREY = np.array([0.1, 0.2, 1 / 3])
 @pytest.fixture
 def scene(store: Store) -> Scene:
     made = store.scenes.add(make_gaussians(), make_cameras(), name="a")[0]
-    MeanColours(store).save(made.id, GREY)
+    MeanColours(store).add(made.id, GREY)
     return made
 
 
@@ -63,7 +67,7 @@ def test_it_is_read_as_it_was_saved_and_listed(store: Store, scene: Scene) -> No
     assert store.graphs.find(key("colours", scene.id)) is None
     assert store.graphs.stored_keys([key("colours", scene.id)]) == set()
     with raises(InputError, code="key_input_mismatch"):
-        colours.put(scene.id, key("colours"), {"mean": GREY[None]}, num_items=1)
+        colours.save((scene.id, GREY), key("colours"))
 
 
 def test_a_clone_and_a_merge_carry_it(store: Store, scene: Scene, tmp_path: Path) -> None:
@@ -73,7 +77,7 @@ def test_a_clone_and_a_merge_carry_it(store: Store, scene: Scene, tmp_path: Path
     with Store.create(tmp_path / "other.gsmap") as other:
         merging.merge(other, store)
         assert np.array_equal(MeanColours(other).load(scene.id), GREY)
-        MeanColours(other).put(scene.id, key("colours", scene.id, bright=True), {"mean": GREY[None] + 1}, num_items=1)
+        MeanColours(other).save((scene.id, GREY + 1), key("colours", scene.id, bright=True))
         merging.merge(other, store)  # a scene has one of a kind: the map keeps its own
         assert MeanColours(other).load(scene.id) is None
         assert other.check().ok
@@ -84,10 +88,10 @@ def test_of_a_thinned_scene_it_is_forgotten_and_not_copied(store: Store, scene: 
         other.scenes.add(make_gaussians(), make_cameras(), name="a")
         store.scenes.thin("a", np.arange(scene.num_gaussians) < 100)
         assert MeanColours(store).load(scene.id) is None
-        MeanColours(store).save(scene.id, GREY)  # of the Gaussians that are left
+        MeanColours(store).add(scene.id, GREY)  # of the Gaussians that are left
         merging.merge(other, store)
         assert MeanColours(other).load(scene.id) is None
-        MeanColours(other).save(scene.id, 2 * GREY)
+        MeanColours(other).add(scene.id, 2 * GREY)
         merging.merge(store, other)  # the scene is whole again, and the result comes with it
         assert np.array_equal(MeanColours(store).load(scene.id), 2 * GREY)
 

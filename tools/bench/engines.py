@@ -2,16 +2,22 @@
 
     python -m tools.bench.engines [--workers 2] [--jobs 100] [--soak 600] [--kill-every 30] [--wait] [--dask]
     python -m tools.bench.engines --update [--workers 2]
+    python -m tools.bench.engines --commits 1000 --capture CAPTURE.ply
 
 Efficiency is the CPU seconds that the jobs themselves take, over the wall seconds times the workers; on a machine that
 does other work besides, CPU seconds of the whole over those of the jobs say more. The soak kills one of four workers
 every so often; every job writes down that it was begun, every result is committed once, in a table of its own.
+
+--commits: how many cores can describe for one process that commits. CPU seconds of describing one capture, CPU seconds
+of the committing process for a result of that size, staged by workers or sent to it, and their quotient. The jobs are
+stood in for: all are leased at once and return at once, as those of a large cluster.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import pickle
 import random
 import resource
 import shutil
@@ -24,11 +30,13 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from gsmap.engine.executors import local
-from tools.harness import argument_parser
+from tools.harness import argument_parser, timed
 
 
 def burn(index: int, seconds: float, begun: str = "", wait: bool = False) -> tuple[int, float]:
@@ -57,7 +65,12 @@ def main() -> None:
     )
     parser.add_argument("--dask", action="store_true", help="on a LocalCluster instead of the local pool")
     parser.add_argument("--update", action="store_true", help="instead: a map of 3 small scenes is given a fourth")
+    parser.add_argument("--commits", type=int, default=0, help="instead: results that one process commits")
+    parser.add_argument("--capture", type=Path, help="a capture of real size, for --commits")
     arguments = parser.parse_args()
+    if arguments.commits:
+        commits(arguments.capture, arguments.commits)
+        return
     if arguments.update:
         update(arguments.workers)
         return
@@ -135,6 +148,78 @@ def update(most: int) -> None:
             again = shutil.copytree(site, Path(folder, f"{workers}.gsmap"))
             spent = gsmap(workers, "update", again, paths[3])
             print(f"3 + 1 scenes, {workers} worker{'s' * (workers > 1)}: {spent:.1f} CPU s", flush=True)
+
+
+def commits(capture: Path, count: int) -> None:
+    """Print how many cores can describe for one committing process."""
+    import gsmap.map
+    from gsmap.map import jobs
+    from gsmap.map.stages import describe
+
+    made: list[Any] = []
+
+    def job(*arguments: Any) -> Any:
+        made.append(timed(jobs.describe_scene, *arguments))
+        return made[0][0]
+
+    with tempfile.TemporaryDirectory() as folder:
+        unstaged = mock.patch.object(jobs, "staged", lambda results, found, key, inbox: found)
+        with gsmap.map.create(Path(folder, "one.gsmap")) as m, unstaged:
+            m.ingest(capture)
+            with mock.patch.object(describe, "describe_scene", job):
+                m.describe()
+        found, job_s = made[0]
+        print(f"{capture.name}: {job_s:.1f} CPU s to describe, {len(pickle.dumps(found)) / 1e6:.1f} MB of results")
+        for staged, number in ((True, count), (False, min(count, 30))):
+            took = committing(Path(folder, f"{staged}.gsmap"), found, number, staged)
+            what = "staged by workers" if staged else "sent to the committing process"
+            print(f"{number} results {what}: {1e3 * took:.1f} CPU ms to commit one, full at {job_s / took:.0f} cores")
+
+
+def committing(path: Path, found: tuple[Any, Any], count: int, staged: bool) -> float:
+    """CPU seconds for each of so many results, of the process that leases their jobs and commits them."""
+    import gsmap.map
+    from gsmap.map.stages import describe
+    from gsmap.register.recipe import prepared_key
+    from gsmap.store.arrays import Arrays, StagedGroup
+    from tools.bench.values import make_scenes
+
+    took = 0.0
+    first: dict[str, StagedGroup] = {}
+    write = Arrays.stage_into
+
+    def link(self: Arrays, inbox: str, arrays: Any, kind: str, name: str) -> StagedGroup:
+        """Stage the first group of each kind, and links to its files for all others."""
+        if kind not in first:
+            first[kind] = write(self, "kept", arrays, kind, name)
+        made = self.staging / inbox / name
+        shutil.copytree(first[kind].folder, made, copy_function=os.link)
+        return StagedGroup(made, first[kind].files)
+
+    def cluster(job: Any, arguments: Any, params: Any) -> Iterator[tuple[int, Any]]:
+        """Take all jobs at once, and return their results one after the other; only the caller's time counts."""
+        nonlocal took
+        todo = list(arguments)
+        ready = []
+        took += time.process_time()
+        for _, scene, _, _, key, inbox in todo:
+            graph, prepared = replace(found[0], scene_id=scene), replace(found[1], scene=scene)
+            if staged:
+                graph = m.store.graphs.stage(graph, key, inbox)
+                prepared = m.store.prepared_scenes.stage(prepared, prepared_key().of(scene, key.digest), inbox)
+            ready.append(pickle.dumps((graph, prepared)))
+        took -= time.process_time()
+        for index, packed in enumerate(ready):
+            yield index, pickle.loads(packed)
+
+    with gsmap.map.create(path) as m:
+        make_scenes(m, count)
+        (m.store.arrays.staging / "kept").mkdir()
+        with mock.patch.object(describe, "run_jobs", cluster), mock.patch.object(Arrays, "stage_into", link):
+            took -= time.process_time()
+            m.describe()
+            took += time.process_time()
+    return took / count
 
 
 def gsmap(workers: int, *arguments: object) -> float:

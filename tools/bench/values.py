@@ -65,10 +65,7 @@ def run(folder: Path, scenes: int, gaussians: int) -> Iterator[str]:
 def make_map(path: Path, scenes: int, gaussians: int, seed: int) -> None:
     """A map whose scenes are described, registered with each other, and placed in a row."""
     with gsmap.map.create(path) as m:
-        for k in range(scenes):
-            m.store.scenes.add(
-                _gaussians(gaussians, seed + k), _cameras(), name=f"scene{seed + k}", scale_policy="known"
-            )
+        make_scenes(m, scenes, gaussians, seed)
         living = m.scenes()
         keys = graph_keys(m.store, living, m.settings)
         for scene in living:
@@ -82,6 +79,12 @@ def make_map(path: Path, scenes: int, gaussians: int, seed: int) -> None:
                 outcomes[a.id, b.id] = EdgeOutcome("used", 1.0)
         poses = {s.id: ScenePose(s.id, _step(k), 0, "placed", np.eye(7) * 1e-4) for k, s in enumerate(living)}
         m.store.revisions.save(PoseGraph(poses, outcomes))
+
+
+def make_scenes(m: Map, scenes: int, gaussians: int = 50, seed: int = 0) -> None:
+    """Add small scenes."""
+    for k in range(seed, seed + scenes):
+        m.store.scenes.add(_gaussians(gaussians, k), _cameras(), name=f"scene{k}", scale_policy="known")
 
 
 def jobs_of_update(m: Map) -> tuple[int, int, int]:

@@ -140,14 +140,24 @@ def _node_rows(graph: SceneGraph) -> tuple[NodeRow, ...]:
 
 def graph_row(store: Store, scene: Scene, key: RecipeKey) -> GraphRow:
     """Return the row of a stored graph."""
-    graph = store.graphs.load(scene.id, key)
+    graph = store.graphs.find(key)
     assert graph is not None
+    layers = []
+    for name, count in graph.layers.items():
+        about = graph.about_layers[name]
+        row = LayerRow(
+            layer=name,
+            num_nodes=count,
+            descriptor_id=about.get("descriptor_id", ""),
+            unit_m=about.get("unit_m", 1.0),
+        )
+        layers.append(row)
     return GraphRow(
         scene=scene.id,
         scene_name=scene.name,
         num_nodes=graph.num_nodes,
-        layers=_layer_rows(graph),
-        up=graph.up,
+        layers=tuple(layers),
+        up=None if graph.up is None else np.array(graph.up),
         unit_m=graph.unit_m,
         key=key.digest,
         notes=graph.notes,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from typing import TypeVar
 
@@ -59,24 +59,26 @@ def describe(
     rendered_by = backend(settings.describe.object.render_backend)
     params = replace(settings.describe, object=replace(settings.describe.object, render_backend=rendered_by))
     names = {keys[scene.id].digest: scene.name for scene in missing}
-    jobs = {keys[scene.id].digest: (store.location, scene.id, specs, params) for scene in missing}
 
     def done(wanted: Collection[str]) -> set[str]:
         return store.graphs.stored_keys(wanted) - store.graphs.damaged(damaged.intersection(wanted))
 
     about = {keys[scene.id].digest: (scene.id,) for scene in missing}
-    shared = SharedJobs(store, "describe", "graph", jobs, about, done, progress, again=verify)
-    results = shared.results(lambda arguments: run_jobs(describe_scene, arguments, settings.engine))
     there = len(scenes) - len(missing)
     from gsmap.register.recipe import prepared_key  # imports the registration, which reading a map does not need
 
-    kept = note_interruption(lambda: f"{there + shared.num_kept()} of {len(scenes)} scenes are described and kept")
-    with kept, closing(results):
-        for key, (graph, prepared) in results:
-            store.graphs.save(graph, keys[graph.scene_id])
-            if prepared is not None:
-                store.prepared_scenes.save(prepared, prepared_key().of(graph.scene_id, key))
-            shared.saved(key, f"{names[key]}: {graph.num_nodes} nodes")
+    with store.arrays.inbox() if missing else nullcontext("") as inbox:
+        jobs = {keys[s.id].digest: (store.location, s.id, specs, params, keys[s.id], inbox) for s in missing}
+        shared = SharedJobs(store, "describe", "graph", jobs, about, done, progress, again=verify)
+        results = shared.results(lambda arguments: run_jobs(describe_scene, arguments, settings.engine))
+        kept = note_interruption(lambda: f"{there + shared.num_kept()} of {len(scenes)} scenes are described and kept")
+        with kept, closing(results):
+            for key, (graph, prepared) in results:
+                (scene,) = about[key]
+                with store.transaction():
+                    num_nodes = store.graphs.save(graph, keys[scene])
+                    store.prepared_scenes.save(prepared, prepared_key().of(scene, key))
+                shared.saved(key, f"{names[key]}: {num_nodes} nodes")
     if verify:  # those of other recipes cannot be made again, and nothing needs them any more
         others = [graph.key for graph in store.graphs.list() if graph.scene in keys]
         if beyond_help := store.graphs.damaged(others):

@@ -313,12 +313,13 @@ def ensure(
     if not missing:
         return
     params, specs = settings.localize, models.specs(store)
-    jobs = {keys[scene.id].digest: (store.location, scene.id, specs, params) for scene in missing}
+    jobs = {keys[scene.id].digest: (store.location, scene.id, specs, params, keys[scene.id]) for scene in missing}
     names = {keys[scene.id].digest: scene.name for scene in missing}
 
     def make_in_memory() -> None:
         left = [scene for scene in missing if scene.id not in held]
-        running = run_jobs(features_of_scene, iter([jobs[keys[scene.id].digest] for scene in left]), settings.engine)
+        arguments = [(*jobs[keys[scene.id].digest], None) for scene in left]
+        running = run_jobs(features_of_scene, iter(arguments), settings.engine)
         for count, (number, found) in enumerate(running):
             if not isinstance(found, QuarantinedJob):
                 held[left[number].id] = found
@@ -332,21 +333,20 @@ def ensure(
         return store.view_features.stored_keys(wanted)
 
     about = {keys[scene.id].digest: (scene.id,) for scene in missing}
-    shared = SharedJobs(store, "localize", "views", jobs, about, done, progress)
-    results = shared.results(lambda arguments: run_jobs(features_of_scene, arguments, settings.engine))
     there = len(scenes) - len(missing)
     try:
-        with (
-            note_interruption(lambda: f"the views of {there + shared.num_kept()} of {len(scenes)} scenes are kept"),
-            closing(results),
-        ):
-            for key, found in results:
-                try:
-                    store.view_features.save(found, keys[found.scene])
-                except (DiskFullError, ReadOnlyError):
-                    held[found.scene] = found
-                shared.saved(key, f"{names[key]}: {found.num_features} features of {found.num_views} views")
-    except (DiskFullError, ReadOnlyError) as error:  # leases cannot be written
+        with store.arrays.inbox() as inbox:
+            staged = {key: (*arguments, inbox) for key, arguments in jobs.items()}
+            shared = SharedJobs(store, "localize", "views", staged, about, done, progress)
+            results = shared.results(lambda arguments: run_jobs(features_of_scene, arguments, settings.engine))
+            with (
+                note_interruption(lambda: f"the views of {there + shared.num_kept()} of {len(scenes)} scenes are kept"),
+                closing(results),
+            ):
+                for key, found in results:
+                    count = store.view_features.save(found, keys[about[key][0]])
+                    shared.saved(key, f"{names[key]}: {count} features")
+    except (DiskFullError, ReadOnlyError) as error:
         _log.warning("view features are computed for this run alone: %s", error)
         stored = store.view_features.stored_keys(jobs)
         missing = [scene for scene in missing if keys[scene.id].digest not in stored]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 
 from gsmap.engine import QuarantinedJob, run_jobs
 from gsmap.errors import DiskFullError, ReadOnlyError
@@ -21,13 +22,11 @@ def prepare_missing(store: Store, graphs: Iterable[tuple[str, str]], settings: S
     recipe = prepared_key()
     keys = {scene: recipe.of(scene, graph) for scene, graph in graphs}
     kept = store.prepared_scenes.stored_keys(keys.values())
-    jobs = [(store.location, *key.inputs) for key in keys.values() if key.digest not in kept]
-    if not jobs or not store.catalog.writable:
+    missing = [key for key in keys.values() if key.digest not in kept]
+    if not missing or not store.catalog.writable:
         return
-    for _, found in run_jobs(prepare_scene, jobs, settings.engine):
-        if isinstance(found, QuarantinedJob):
-            continue
-        try:
-            store.prepared_scenes.save(found, keys[found.scene])
-        except (DiskFullError, ReadOnlyError):
-            return
+    with suppress(DiskFullError, ReadOnlyError), store.arrays.inbox() as inbox:
+        jobs = [(store.location, key.inputs[0], key, inbox) for key in missing]
+        for number, found in run_jobs(prepare_scene, jobs, settings.engine):
+            if not isinstance(found, QuarantinedJob):
+                store.prepared_scenes.save(found, missing[number])
