@@ -16,8 +16,8 @@ from gsmap.geometry.metric_scale import in_metres, scale_gaussians
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.methods import RecipeKey, family
 from gsmap.store import Store, branches, remote_map, sqlite
+from gsmap.store.array_groups import ArrayResults, StagedResult
 from gsmap.store.photos import StoredPhoto
-from gsmap.store.results import ArrayResults, StagedResult
 from gsmap.types import (
     Cameras,
     ChangeReport,

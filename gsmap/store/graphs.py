@@ -10,13 +10,12 @@ from sqlalchemy import Connection, Row, Text, true, type_coerce
 
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
-from gsmap.store.array_groups import manifest, num_bytes, unless_pruned, unname
+from gsmap.store.array_groups import ArrayResults, PackedResult, manifest, num_bytes, unless_pruned, unname
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog, next_timestamp
 from gsmap.store.catalog_rows import located_graphs
 from gsmap.store.graph_content import from_arrays, shapes_of, to_arrays
 from gsmap.store.result_rows import GRAPHS
-from gsmap.store.results import ArrayResults, PackedResult
 from gsmap.store.row_index_maps import RowIndexMaps
 from gsmap.store.scene_refs import resolve
 from gsmap.store.schema import scenes

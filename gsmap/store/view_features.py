@@ -13,10 +13,11 @@ from sqlalchemy import Row
 
 from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
+from gsmap.store.array_groups import PackedResult
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
 from gsmap.store.layout import Shape
-from gsmap.store.results import DerivedArrays, PackedResult
+from gsmap.store.results import DerivedArrays
 from gsmap.types import Cameras
 from gsmap.types.localization import SceneFeatures
 

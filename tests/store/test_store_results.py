@@ -12,10 +12,11 @@ from store_samples import key, make_cameras, make_gaussians
 
 from gsmap.errors import CorruptError, InputError
 from gsmap.store import Store, merging, purging
+from gsmap.store.array_groups import PackedResult
 from gsmap.store.backup import restoring
 from gsmap.store.column_types import is_object_set
 from gsmap.store.result_rows import ResultRows
-from gsmap.store.results import DerivedArrays, PackedResult
+from gsmap.store.results import DerivedArrays
 from gsmap.store.schema import results
 from gsmap.store.sizes import sizes
 from gsmap.types import Scene, SceneGraph
