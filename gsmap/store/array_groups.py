@@ -163,7 +163,9 @@ class ArrayResults(Generic[Value]):
             if isinstance(found, StagedResult):
                 self._check_key(found.scene, key)
                 if not self._rows.is_valid(found.about):
-                    raise InputError(f"a worker returned invalid metadata of {self._noun} {found.scene[:12]}")
+                    raise InputError(
+                        f"a worker returned invalid metadata of {self._noun} {found.scene[:12]}", code="invalid_record"
+                    )
                 result = replace(found, staged=self._arrays.received(found.staged, self._rows.kind, found.group_id))
             else:
                 packed, group_id = self._packed(found, key)
