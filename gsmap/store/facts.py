@@ -108,7 +108,10 @@ def validated_facts(edits: SceneEdits) -> list[tuple[str, str]]:
 
     Raises:
         InputError: an empty name or note, control characters, an invalid date or scale.
+        TypeError: an edit of another name.
     """
+    if unknown := edits.keys() - SceneEdits.__annotations__.keys():
+        raise TypeError(f"a scene has no {', '.join(sorted(unknown))} to edit")
     given = {kind: value for kind, value in edits.items() if value is not None}
     return [(kind, _validated(kind, given[kind])) for kind in SCENE_FACTS if kind in given]
 

@@ -145,3 +145,10 @@ def test_a_date_read_from_a_file_fills_a_gap_and_overrules_nobody(store):
 def test_a_new_scene_keeps_what_its_date_was_read_from(store):
     store.scenes.add(make_gaussians(), make_cameras(), name="a", captured_at="2026-01-01", dated_by="a.json")
     assert said(store, "a")[-1] == ("captured_at", "2026-01-01T00:00:00+00:00", "a.json")
+
+
+def test_edits_of_other_names_are_refused(store, two_scenes):
+    scene = two_scenes[0]
+    for name in ("title", "tag", "untag"):
+        with pytest.raises(TypeError):
+            store.scenes.edit(scene.id, **{name: "x"})
