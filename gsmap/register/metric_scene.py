@@ -84,8 +84,9 @@ class MetricPair:
         return target * self.target.unit_m, source * self.source.unit_m
 
     def to_metres(self, S_target_source: Sim3) -> Sim3:
-        """Convert a pose of the proposed scale from the scenes' own units to working metres."""
-        return Sim3(S_target_source.rotation, S_target_source.translation * self.target.unit_m)
+        """Convert a pose from the scenes' own units to working metres."""
+        S = S_target_source
+        return Sim3(S.rotation, S.translation * self.target.unit_m, S.scale / self.scale)
 
     def to_scene_units(self, pose: Sim3) -> Sim3:
         """Convert a pose from working metres to the scenes' own units."""

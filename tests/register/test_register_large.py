@@ -1,6 +1,7 @@
 """Places seen from farther than rooms are: the lengths of registration follow, whether or not a metre is known."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from register_worlds import layer, splat_world
 
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.register import SceneView, register_pair
-from gsmap.register.metric_scene import MetricPair
+from gsmap.register.metric_scene import MetricPair, MetricScene
 from gsmap.register.params import Params
 from gsmap.register.proposers.graph import comparable_layers
 from gsmap.types import SceneGraph, Sim3
@@ -67,3 +68,10 @@ def test_layers_of_one_size_are_compared_and_those_near_the_pairs_own_alone():
     assert sizes(far, farther) == [0.25]
     assert sizes(far, far) == [0.25, 0.5]
     assert sizes(far, graph("room", [], 1.0)) == [1.0]
+
+
+def test_poses_of_any_scale_are_converted_to_working_metres() -> None:
+    view: Any = None
+    pair = MetricPair(MetricScene(view, 2.0), MetricScene(view, 3.0), 1.5)
+    S, points = Sim3(np.eye(3), np.array([1.0, 2, 3]), 1.2), np.array([[4.0, -5, 6]])
+    np.testing.assert_allclose(pair.to_metres(S).apply(3 * points), 2 * S.apply(points))
