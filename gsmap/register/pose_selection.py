@@ -85,7 +85,8 @@ def select_pose(
     # A pose that is too uncertain to become an edge still counts as a rival.
     others = [j for j in evaluated if not _same(best, j, target, source) and _may_be_correct(j, best, params)]
     as_similar = [j for j in others if np.isfinite(j.similarity - best.similarity)]
-    num_as_similar = len(as_similar) + sum(not similarity < best.similarity - MARGIN for similarity in elsewhere)
+    least = max(best.similarity - MARGIN, MARGIN)
+    num_as_similar = len(as_similar) + sum(not similarity < least for similarity in elsewhere)
     others = [j for j in others if j not in as_similar]
     probable = _probability_among(best, others, num_as_similar)
     rivals = as_similar or [j for j in others if verdict.is_acceptable(j.proposal, j.evidence, params.verdict)]
@@ -177,8 +178,10 @@ def _lead(a: EvaluatedPose, b: EvaluatedPose) -> float:
 
 def _similarity_of_renders(evidence: PoseEvidence) -> tuple[float, float]:
     """Return `fisher_z` of the colour correlation of renders, and its standard deviation."""
-    r = evidence.colour_correlation
-    return fisher_z(r), abs(r) / max(abs(evidence.colour_t), 1e-3) / max(1.0 - r**2, 1e-3)
+    r, t = evidence.colour_correlation, evidence.colour_t
+    if not t:  # nothing was compared
+        return 0.0, float("inf")
+    return fisher_z(r), abs(r) / max(abs(t), 1e-3) / max(1.0 - r**2, 1e-3)
 
 
 def _most_similar(accepted: Sequence[EvaluatedPose]) -> EvaluatedPose:

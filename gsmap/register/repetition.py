@@ -19,19 +19,22 @@ from gsmap.register.surface import Surface
 from gsmap.types import Sim3
 
 _CELL_M = np.array([0.2, 0.2, 0.4])  # cells are taller than wide, as levels stay where they are;
-_MAX_CELLS = 4_000_000  # of the box of a surface: cells are doubled until it has no more
+_MAX_CELLS = 4_000_000  # of the box of a surface: cells are doubled until it has no more,
+_MAX_SHIFTS = 64_000_000  # and no more shifts, times levels, at any quarter turn
+_STRAY = 0.01  # share of points on each side of each axis that are strays if they lie half the others' extent outside
 _BLUR_CELLS = 0.7  # so that shifts by a fraction of a cell matter little
 _AROUND = (3, 5, 5)  # cells (z, x, y) over which the mean colour is subtracted
 _MIN_CELLS = 150  # fewer common cells correlate by chance,
 _MIN_SHARE = 0.25  # and so do fewer than this share of those under the given pose
 MARGIN = 0.3
-"""A pose is told from another if the surfaces are more similar under it by this much (`fisher_z`)."""
+"""A pose is told from another, and from chance, if the surfaces are more similar under it by this much (`fisher_z`)."""
 _MOST = 0.98  # correlations count up to this
 _PARTS = np.array([[0, 0, 0], [0.5, 0, 0], [0, 0.5, 0], [0.5, 0.5, 0]])  # of a cell by which the cells are offset
 _MAX_PEAKS = 50  # at each quarter turn
 _PEAK_CELLS = 7  # width within which only the highest correlation counts
 _REFINEMENT = 0.2  # by which the similarity may rise when a pose is refined
 _MAX_LOSS = 0.2  # of correlation between the cells, at most
+_ROUNDING = 1e-4  # of sums of squares by fast Fourier transforms
 _DISTANCE_M = 1.0  # nearer poses are refined to the given one
 _OPPONENT = np.array([[0.299, 0.587, 0.114], [1.0, -1.0, 0.0], [0.5, 0.5, -1.0]]).T  # lightness and two chromas
 
@@ -45,20 +48,23 @@ class Repetition:
     """
 
     def __init__(self, target: Surface, source: Surface, pose: Sim3, up: np.ndarray) -> None:
-        self._source, self._pose = source, pose
-        self._level = Sim3(level_frame(up), np.zeros(3))
+        self._pose, self._level = pose, Sim3(level_frame(up), np.zeros(3))
         self._points, self._moved = self._level.apply(target.coarse[0]), (self._level @ pose).apply(source.coarse[0])
-        self._colours = target.coarse[1], source.coarse[1]
+        kept = [_without_strays(points) for points in (self._points, self._moved)]
+        self._points, self._moved, self._source = self._points[kept[0]], self._moved[kept[1]], source.coarse[0][kept[1]]
+        self._colours = target.coarse[1][kept[0]], source.coarse[1][kept[1]]
         self._cell_m = _CELL_M
-        sizes = [np.ptp(points, axis=0) if len(points) else 0.0 for points in (self._points, self._moved)]
-        while max(np.prod(size / self._cell_m + 1) for size in sizes) > _MAX_CELLS:
+        sizes = np.array(
+            [np.ptp(points, axis=0) if len(points) else np.zeros(3) for points in (self._points, self._moved)]
+        )
+        while _is_too_large(sizes / self._cell_m + 1):
             self._cell_m = 2 * self._cell_m
 
     def similarity(self, pose: Sim3) -> float:
         """Return how similar both surfaces are under a pose: `fisher_z` of the correlation of their colours, averaged
         over positions of the cells; NaN where they have too little in common.
         """
-        moved = (self._level @ pose).apply(self._source.coarse[0])
+        moved = (self._level @ pose).apply(self._source)
         return fisher_z(float(np.mean([self._correlation(moved, part * self._cell_m) for part in _PARTS])))
 
     def _correlation(self, moved: np.ndarray, offset: np.ndarray) -> float:
@@ -91,7 +97,7 @@ class Repetition:
             return []
         grid = _Grid.of(self._points, self._colours[0], self._cell_m)
         found, centre, enough = list[tuple[Sim3, float]](), np.median(self._moved, axis=0), 0.0
-        least = own - MARGIN - _REFINEMENT
+        least = max(own - MARGIN, MARGIN) - _REFINEMENT
         for quarter in range(4):
             turn = _quarter_turn(quarter, centre)
             other = _Grid.of(turn.apply(self._moved), self._colours[1], self._cell_m)
@@ -100,7 +106,7 @@ class Repetition:
             if quarter == 0:
                 enough = max(_MIN_SHARE * count[tuple(first % count.shape)], _MIN_CELLS)
             correlation[count < enough] = 0.0
-            is_peak = correlation == maximum_filter(correlation, _PEAK_CELLS, mode="wrap")
+            is_peak = (correlation == maximum_filter(correlation, _PEAK_CELLS, mode="wrap")) & (count >= enough)
             peaks = np.argwhere(is_peak & (correlation > np.tanh(least) - _MAX_LOSS))
             for at in peaks[np.argsort(-correlation[tuple(peaks.T)], kind="stable")[:_MAX_PEAKS]]:
                 peak, part = _interpolated(correlation, at)
@@ -109,6 +115,22 @@ class Repetition:
                     S = self._level.inverse() @ Sim3(turn.rotation, turn.translation + shift) @ self._level @ self._pose
                     found.append((S, fisher_z(peak)))
         return sorted(found, key=lambda one: -one[1])
+
+
+def _without_strays(points: np.ndarray) -> np.ndarray:
+    """Return a mask of the points that do not lie far outside all others, which would make the boxes of cells huge."""
+    if not len(points):
+        return np.zeros(0, bool)
+    low, high = np.quantile(points, [_STRAY, 1 - _STRAY], axis=0)
+    margin = 0.5 * (high - low) + _CELL_M
+    inside: np.ndarray = ((points >= low - margin) & (points <= high + margin)).all(1)
+    return inside
+
+
+def _is_too_large(cells: np.ndarray) -> bool:
+    """Return whether boxes of (2, 3) cells of target and source take too much memory and time to correlate."""
+    shifts = cells[:, :2].max(1).sum() ** 2 * cells[:, 2].min()
+    return bool(cells.prod(1).max() > _MAX_CELLS or shifts > _MAX_SHIFTS)
 
 
 def _interpolated(values: np.ndarray, at: np.ndarray) -> tuple[float, np.ndarray]:
@@ -201,4 +223,6 @@ def _correlate(target: _Grid, source: _Grid) -> tuple[np.ndarray, np.ndarray]:
         a, b = spectra[0], spectra[1].conj()
         sums += np.stack([(a[2:] * b[2:]).sum(0), a[1] * b[0], a[0] * b[1], a[0] * b[0]])
     products, squares_t, squares_s, count = irfft2(sums, s=size)
-    return products / np.sqrt(squares_t.clip(0) * squares_s.clip(0) + 1e-9), count
+    # Less contrast than this share of the most is a rounding error of the transforms.
+    norm = [np.maximum(squares, _ROUNDING * squares.max() + 1e-9) for squares in (squares_t, squares_s)]
+    return products / np.sqrt(norm[0] * norm[1]), count

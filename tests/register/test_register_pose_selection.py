@@ -190,3 +190,10 @@ def test_a_pose_is_told_from_its_repetitions_by_similarity_alone() -> None:
     source = SimpleNamespace(**vars(SCENE) | {"id": "b"})
     for elsewhere, status in (([0.59], "accepted"), ([0.61], "no_match"), ([1.5], "no_match")):
         assert select_pose(SCENE, source, [similar(0, 0.9)], Params(), seconds={}, elsewhere=elsewhere).status == status
+    weak = [replace(evaluated(shifted(0)), similarity=0.4)]
+    for elsewhere, status in (([0.2], "accepted"), ([0.35], "no_match")):
+        assert select_pose(SCENE, source, weak, Params(), seconds={}, elsewhere=elsewhere).status == status
+    # Where the renders were not compared, only cells count.
+    none = replace(SURE, colour_correlation=0.0, colour_t=0.0)
+    rival = replace(evaluated(shifted(3), "colours disagree", evidence=none), similarity=0.8)
+    assert select(rival, replace(similar(0, 0.9), evidence=replace(SURE, colour_t=400.0))).status == "no_match"

@@ -131,6 +131,52 @@ def test_similarity_is_that_of_cells_counted_one_by_one() -> None:
     assert found == pytest.approx(np.arctanh(np.mean(correlations)), rel=1e-3)
 
 
+def room(seed: int, noise: float) -> Surface:
+    """A floor and two walls with a random pattern that two captures show with noise of their own."""
+    rng, look, size = np.random.default_rng(seed), np.random.default_rng(7), np.array([8, 6, 2.5])
+    points, colours = [], []
+    for axis in range(3):
+        face = rng.uniform(0, 1, (10_000, 3)) * size
+        face[:, axis] = 0
+        patch = tuple((np.delete(face, axis, 1) / 0.4).astype(int).T)
+        shared, own = look.uniform(0.2, 0.8, (20, 20, 3))[patch], rng.uniform(0.2, 0.8, (20, 20, 3))[patch]
+        points.append(face)
+        colours.append((1 - noise) * shared + noise * own)
+    return Surface(np.concatenate(points), np.concatenate(colours).astype(np.float32), 0.05)
+
+
+@pytest.mark.guards("answers")
+def test_noise_is_no_repetition() -> None:
+    level = np.array([0.0, 0, 1])
+    for noise in (0.5, 0.6):
+        repetition = Repetition(room(1, noise), room(2, noise), Sim3.identity(), level)
+        assert 0.2 < repetition.similarity(Sim3.identity()) < 0.7
+        assert not any(similarity > MARGIN for _, similarity in repetition.elsewhere())
+        far = [np.linalg.norm(S.apply([4, 3, 1]) - [4, 3, 1]) for S, _ in repetition.elsewhere()]
+        assert max(far, default=0) < 8  # the surfaces have something in common
+
+
+def test_where_colours_are_even_nothing_is_similar() -> None:
+    captures = []
+    for seed in (1, 2):
+        surface = room(seed, 0.0)
+        even = (surface.points[:, :2] > 2).any(1)
+        captures.append(Surface(surface.points, np.where(even[:, None], np.float32(0.6), surface.colours), 0.05))
+    assert Repetition(*captures, Sim3.identity(), np.array([0.0, 0, 1])).elsewhere() == []
+
+
+def test_points_far_outside_change_nothing() -> None:
+    plain, stray = [room(1, 0.3), room(2, 0.3)], []
+    far = np.array([1e5, 0, 0]) + np.random.default_rng(0).normal(0, 0.05, (12, 3))
+    for surface in plain:
+        points, colours = np.concatenate([surface.points, far]), np.concatenate([surface.colours, surface.colours[:12]])
+        stray.append(Surface(points, colours, 0.05))
+    identity, level = Sim3.identity(), np.array([0.0, 0, 1])
+    expected, found = (Repetition(*pair, identity, level) for pair in (plain, stray))
+    assert found.similarity(identity) == expected.similarity(identity)
+    assert found.elsewhere() == expected.elsewhere()
+
+
 def test_too_little_in_common_is_not_known() -> None:
     small = Surface(np.random.default_rng(0).uniform(0, 1, (500, 3)), np.full((500, 3), 0.5, np.float32), 0.05)
     repetition = Repetition(small, small, Sim3.identity(), np.array([0.0, 0, 1]))
