@@ -290,7 +290,8 @@ def rival_probability(poses: Sequence[EvaluatedPose]) -> float:
     best = poses[0]
     for other in poses[1:]:
         far = np.linalg.norm(best.refined.T_metric_camera[:3, 3] - other.refined.T_metric_camera[:3, 3])
-        if other.candidate.component != best.candidate.component or far > _OTHER_PLACE_M * best.refined.scale:
+        scale = min(best.refined.scale, other.refined.scale)
+        if other.candidate.component != best.candidate.component or far > _OTHER_PLACE_M * scale:
             return other.probability
     return 0.0
 

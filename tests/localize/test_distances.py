@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -80,3 +82,14 @@ def test_a_pose_a_metre_apart_is_no_rival_where_content_is_far_away(world, enlar
     beside[0, 3] += 1.0
     other = replace(found, refined=replace(found.refined, T_metric_camera=beside), probability=0.4)
     assert localization.rival_probability([found, other]) == (0.4 if rival else 0.0)
+
+
+def test_a_rival_from_which_content_is_near_counts_whichever_pose_is_first() -> None:
+    def pose(x: float, scale: float) -> Any:
+        T = np.eye(4)
+        T[0, 3] = x
+        refined = SimpleNamespace(T_metric_camera=T, scale=scale)
+        return SimpleNamespace(refined=refined, candidate=SimpleNamespace(component=0), probability=0.9)
+
+    for poses in ([pose(0, 10.0), pose(4, 1.0)], [pose(4, 1.0), pose(0, 10.0)]):
+        assert localization.rival_probability(poses) == 0.9
