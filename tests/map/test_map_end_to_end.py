@@ -76,7 +76,7 @@ def test_json_keeps_the_contract(site: Path) -> None:
     """The keys that scripts outside rely on; docs/reference/json.md lists all."""
     scenes = json.loads(cli("list", site, "scenes", "--json"))["scenes"]
     wanted = ["name", "id", "num_gaussians", "num_nodes", "component", "S_map_scene", "captured_at", "status"]
-    assert list(scenes[0])[: len(wanted)] == wanted
+    assert set(wanted) <= set(scenes[0])
     assert np.shape(scenes[0]["S_map_scene"]) == (4, 4)
     edges = json.loads(cli("list", site, "edges", "--json"))["edges"]
     assert set(edges[0]) >= {

@@ -137,7 +137,7 @@ def test_the_graph_is_written_and_is_what_networkx_gets(site: Map, tmp_path: Pat
     assert [row["room"] for row in shown["objects"]] == [room.id] * len(report.objects)
     (drawn,) = shown["rooms"]
     assert drawn["outline"] == room.outline.tolist()
-    assert (drawn["area_m2"], drawn["doors"]) == (room.area_m2, ())
+    assert (drawn["area_m2"], drawn["doors"]) == (room.area_m2, [])
     assert set(graph.nodes) == {row.id for row in report.objects} | {room.id}
     assert graph.number_of_edges() == len(report.relations) + len(room.objects)
     site.write_graph(tmp_path / "o.graphml", "graphml")

@@ -77,7 +77,8 @@ def describe(
                 (scene,) = about[key]
                 with store.transaction():
                     num_nodes = store.graphs.save(graph, keys[scene])
-                    store.prepared_scenes.save(prepared, prepared_key().of(scene, key))
+                    if prepared is not None:
+                        store.prepared_scenes.save(prepared, prepared_key().of(scene, key))
                 shared.saved(key, f"{names[key]}: {num_nodes} nodes")
     if verify:  # those of other recipes cannot be made again, and nothing needs them any more
         others = [graph.key for graph in store.graphs.list() if graph.scene in keys]
