@@ -23,7 +23,8 @@ class Params:
             ``always``.
         proposers: Settings of each proposer.
         max_poses: Largest number of poses, at least 1, that are refined and verified in each round of proposals, and
-            again the largest number of rival poses per accepted pose; a larger value finds more matches and is slower.
+            again the largest number of rival poses per accepted pose, and of poses elsewhere under which the surfaces
+            are about as similar; a larger value finds more matches and is slower.
         coarse_refiner: Method of the first refinement, which brings a proposed pose near enough to be verified;
             ``none`` skips it.
         refiner: Method of the final refinement: ``colored_icp``, ``gicp``, ``icp`` (as Graph-GSReg) or ``none``.
