@@ -32,6 +32,7 @@ _CELL_M = 0.4  # ... and over a cell of this size for scenes without cameras
 _MIN_SEEN = 100  # cameras of a scene that see fewer Gaussians of the other scene are ignored
 NUM_CAMERAS = 6  # of each scene, chosen to see most of the other scene
 MAX_POINTS = 12_000  # of each scene that are tested for coincidence
+OPPONENT = np.array([[0.299, 0.587, 0.114], [1.0, -1.0, 0.0], [0.5, 0.5, -1.0]]).T  # lightness and two chromas of RGB
 
 
 @dataclass(frozen=True)
@@ -281,8 +282,7 @@ def _pattern_correlation(a: np.ndarray, b: np.ndarray, patch: np.ndarray) -> np.
 
 def _opponent_colours(colours: np.ndarray) -> np.ndarray:
     """Return (N, 3) lightness and two chromas of RGB."""
-    opponent = np.array([[0.299, 0.587, 0.114], [1.0, -1.0, 0.0], [0.5, 0.5, -1.0]]).T
-    out: np.ndarray = np.clip(colours, 0.0, 1.0) @ opponent
+    out: np.ndarray = np.clip(colours, 0.0, 1.0) @ OPPONENT
     return out
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.geometry.directions import level_frame
+from gsmap.register.evidence import OPPONENT
 from gsmap.register.surface import Surface
 from gsmap.types import Sim3
 
@@ -36,7 +37,6 @@ _REFINEMENT = 0.2  # by which the similarity may rise when a pose is refined
 _MAX_LOSS = 0.2  # of correlation between the cells, at most
 _ROUNDING = 1e-4  # of sums of squares by fast Fourier transforms
 _DISTANCE_M = 1.0  # nearer poses are refined to the given one
-_OPPONENT = np.array([[0.299, 0.587, 0.114], [1.0, -1.0, 0.0], [0.5, 0.5, -1.0]]).T  # lightness and two chromas
 
 
 class Repetition:
@@ -65,26 +65,16 @@ class Repetition:
         over positions of the cells; NaN where they have too little in common.
         """
         moved = (self._level @ pose).apply(self._source)
-        return fisher_z(float(np.mean([self._correlation(moved, part * self._cell_m) for part in _PARTS])))
+        grids = (self._grids(moved, part * self._cell_m) for part in _PARTS)
+        return fisher_z(float(np.mean([_common_correlation(*pair) for pair in grids])))
 
-    def _correlation(self, moved: np.ndarray, offset: np.ndarray) -> float:
-        """Return the correlation with the moved points of the source in cells that are offset, or NaN."""
-        grids = [
-            _Grid.of(points + offset, colours, self._cell_m)
-            for points, colours in zip((self._points, moved), self._colours, strict=True)
-        ]
-        low, high = np.maximum(*(grid.low for grid in grids)), np.minimum(*(grid.high for grid in grids))
-        if (high <= low).any():
-            return float("nan")
-        parts = []
-        for grid in grids:
-            x, y, z = (slice(f, t) for f, t in zip(low - grid.low, high - grid.low, strict=True))
-            parts.append((grid.occupied[z, x, y] > 0, grid.contrast[:, z, x, y]))
-        common = parts[0][0] & parts[1][0]
-        if common.sum() < _MIN_CELLS:
-            return float("nan")
-        a, b = (contrast[:, common] for _, contrast in parts)
-        return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum() + 1e-9))
+    def _grids(self, moved: np.ndarray, offset: np.ndarray) -> tuple[_Grid, _Grid]:
+        """Return the target, and the source whose points are moved, in cells that are offset."""
+        target, source = self._colours
+        return (
+            _Grid.of(self._points + offset, target, self._cell_m),
+            _Grid.of(moved + offset, source, self._cell_m),
+        )
 
     def elsewhere(self) -> list[tuple[Sim3, float]]:
         """Return poses far from the given one under which the surfaces may be about as similar, or more so, once they
@@ -92,15 +82,16 @@ class Repetition:
         """
         from scipy.ndimage import maximum_filter
 
-        own = fisher_z(self._correlation(self._moved, np.zeros(3)))
+        grid, other = self._grids(self._moved, np.zeros(3))
+        own = fisher_z(_common_correlation(grid, other))
         if not np.isfinite(own):
             return []
-        grid = _Grid.of(self._points, self._colours[0], self._cell_m)
         found, centre, enough = list[tuple[Sim3, float]](), np.median(self._moved, axis=0), 0.0
         least = max(own - MARGIN, MARGIN) - _REFINEMENT
         for quarter in range(4):
             turn = _quarter_turn(quarter, centre)
-            other = _Grid.of(turn.apply(self._moved), self._colours[1], self._cell_m)
+            if quarter:
+                other = _Grid.of(turn.apply(self._moved), self._colours[1], self._cell_m)
             correlation, count = _correlate(grid, other)
             extent, first = np.array(other.occupied.shape[1:]), (other.low - grid.low)[:2]
             if quarter == 0:
@@ -198,12 +189,28 @@ class _Grid:
         )
         around = np.maximum(uniform_filter(occupied, _AROUND, mode="constant"), np.float32(1e-6))
         contrast = np.empty((3, *shape), np.float32)
-        for channel, values in zip(contrast, (colours @ _OPPONENT).T, strict=True):
+        for channel, values in zip(contrast, (colours @ OPPONENT).T, strict=True):
             sums = np.bincount(flat, values, size).astype(np.float32).reshape(shape)
             channel[:] = gaussian_filter(sums, blur, mode="constant") / weight * occupied
             channel -= uniform_filter(channel, _AROUND, mode="constant") / around
             channel *= occupied
         return cls(low, occupied, contrast)
+
+
+def _common_correlation(target: _Grid, source: _Grid) -> float:
+    """Return the correlation of contrasts over the cells that are occupied in both grids; NaN if these are too few."""
+    low, high = np.maximum(target.low, source.low), np.minimum(target.high, source.high)
+    if (high <= low).any():
+        return float("nan")
+    parts = []
+    for grid in (target, source):
+        x, y, z = (slice(f, t) for f, t in zip(low - grid.low, high - grid.low, strict=True))
+        parts.append((grid.occupied[z, x, y] > 0, grid.contrast[:, z, x, y]))
+    common = parts[0][0] & parts[1][0]
+    if common.sum() < _MIN_CELLS:
+        return float("nan")
+    a, b = (contrast[:, common] for _, contrast in parts)
+    return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum() + 1e-9))
 
 
 def _correlate(target: _Grid, source: _Grid) -> tuple[np.ndarray, np.ndarray]:
