@@ -19,6 +19,7 @@ from gsmap.register.proposal_rounds import num_nodes
 from gsmap.register.repetition import MARGIN, fisher_z
 from gsmap.register.scene_view import SceneView
 from gsmap.register.unit_scale import ScaleDecision
+from gsmap.texts import counted
 from gsmap.types import Registration, Sim3
 from gsmap.types.registration import Proposal
 
@@ -94,10 +95,11 @@ def select_pose(
         rivals = rivals or sorted(others, key=lambda j: -odds_of(j))
     if accepted and (rivals or num_as_similar):
         status = "no_match"
-        apart = (
-            _describe_distance(best, rivals[0], target, source) if rivals else f"{num_as_similar} poses agree as well"
-        )
-        why = reason("ambiguous", f"ambiguous: {apart}, and the first is correct with a probability of {probable:.0%}")
+        if rivals:
+            told = f"{_describe_distance(best, rivals[0], target, source)}, and the first"
+        else:
+            told = f"the surfaces are as similar under {counted(num_as_similar, 'other pose')}, and this one"
+        why = reason("ambiguous", f"ambiguous: {told} is correct with a probability of {probable:.0%}")
     elif not accepted and not verdict.has_low_nfa(best.proposal, params.verdict):
         status, why = "no_match", verdict.not_significant(best.proposal, params.verdict, best.flaw)
     information = None
