@@ -5,6 +5,8 @@ import itertools
 import os
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from store_samples import key, made_prepared, make_cameras, make_gaussians
 
@@ -49,8 +51,9 @@ def work(path: str, first_seed: int, pipe) -> None:
             pipe.send(("done", "prune", None))
 
 
-def die_at(path: str, seed: int, step: int, pipe) -> None:
-    """Add a scene, and die at the given change of the disk; tells where, or that it came through."""
+@contextmanager
+def dying_at(step: int, pipe) -> Iterator[None]:
+    """Die at the given change of the disk while this is open, and tell where."""
     left = [step]
 
     def hook(event: str, arguments: tuple) -> None:
@@ -60,10 +63,15 @@ def die_at(path: str, seed: int, step: int, pipe) -> None:
                 pipe.send(f"died at {event} {arguments[0]}")
                 os._exit(9)
 
-    with Store.open(path) as store:
-        sys.addaudithook(hook)
+    sys.addaudithook(hook)
+    yield
+    left[0] = -1
+
+
+def die_at(path: str, seed: int, step: int, pipe) -> None:
+    """Add a scene, and die at the given change of the disk; tells where, or that it came through."""
+    with Store.open(path) as store, dying_at(step, pipe):
         add(store, seed)
-        left[0] = -1
     pipe.send("through")
 
 
@@ -168,25 +176,14 @@ def open_and_close(path: str, pipe) -> None:
 
 def stage_and_save(path: str, step: int, pipe) -> None:
     """Describe a scene as a worker and its caller do, and die at the given change of the disk."""
-    left = [step]
-
-    def hook(event: str, arguments: tuple) -> None:
-        if changes_disk(event, arguments):
-            left[0] -= 1
-            if left[0] == 0:
-                pipe.send(f"died at {event} {arguments[0]}")
-                os._exit(9)
-
     with Store.open(path) as store, Store.open(path, "r") as worker:
         scene = store.scenes.list()[0].id
-        sys.addaudithook(hook)
-        with store.arrays.inbox() as inbox:
+        with dying_at(step, pipe), store.arrays.inbox() as inbox:
             staged = worker.graphs.stage(SceneGraph(scene), key("describe", scene), inbox)
             more = worker.prepared_scenes.stage(made_prepared(scene), key("register", scene), inbox)
             with store.transaction():
                 store.graphs.save(staged, key("describe", scene))
                 store.prepared_scenes.save(more, key("register", scene))
-        left[0] = -1
     pipe.send("through")
 
 
