@@ -33,22 +33,24 @@ def corridor(start_m: float, end_m: float, unique: float, seed: int = 0) -> Surf
     return Surface(np.concatenate(points), np.concatenate(colours).astype(np.float32), 0.05)
 
 
-def pair(unique: float, moved: Sim3) -> tuple[Repetition, Sim3]:
-    """Two captures of a corridor that share 9 m, the second in a frame of its own, and the true pose."""
+MOVED = Sim3(Rotation.from_rotvec([0.2, 0.7, -0.4]).as_matrix(), np.array([3.0, -7.0, 2.0]))
+ALONG = Sim3(np.eye(3), TILT @ [PERIOD_M, 0, 0])  # by a period, in the target's frame
+
+
+def pair(unique: float, away: Sim3 | None = None) -> tuple[Repetition, Sim3]:
+    """Two captures of a corridor that share 9 m, the second in a frame of its own, under the true pose moved by
+    ``away``; and the true pose."""
     tilt = Sim3(TILT, np.zeros(3))
     target, source = corridor(0, 18, unique), corridor(9, 27, unique, seed=1)
-    true = tilt @ moved.inverse()
+    true = tilt @ MOVED.inverse()
     target = Surface(tilt.apply(target.points), target.colours, 0.05)
-    source = Surface(moved.apply(source.points), source.colours, 0.05)
-    return Repetition(target, source, true, UP), true
-
-
-MOVED = Sim3(Rotation.from_rotvec([0.2, 0.7, -0.4]).as_matrix(), np.array([3.0, -7.0, 2.0]))
+    source = Surface(MOVED.apply(source.points), source.colours, 0.05)
+    return Repetition(target, source, true if away is None else away @ true, UP), true
 
 
 @pytest.mark.guards("answers")
 def test_poses_whole_periods_off_are_found_in_a_place_that_repeats() -> None:
-    repetition, true = pair(0.0, MOVED)
+    repetition, true = pair(0.0)
     found = []
     for S, similarity in repetition.elsewhere():
         shift = TILT.T @ (S.apply(MOVED.translation) - true.apply(MOVED.translation))
@@ -61,21 +63,15 @@ def test_poses_whole_periods_off_are_found_in_a_place_that_repeats() -> None:
 
 @pytest.mark.guards("answers")
 def test_unique_patches_tell_every_other_pose() -> None:
-    repetition, true = pair(0.5, MOVED)
+    repetition, true = pair(0.5)
     assert repetition.elsewhere() == []
-    along = Sim3(np.eye(3), TILT @ [PERIOD_M, 0, 0])
-    assert repetition.similarity(true) - repetition.similarity(along @ true) > 2 * MARGIN
+    assert repetition.similarity(true) - repetition.similarity(ALONG @ true) > 2 * MARGIN
 
 
 @pytest.mark.guards("answers")
 def test_from_a_wrong_period_the_right_pose_is_the_most_similar_one() -> None:
-    _, true = pair(0.5, MOVED)
-    along = Sim3(np.eye(3), TILT @ [PERIOD_M, 0, 0])
-    tilt = Sim3(TILT, np.zeros(3))
-    target, source = corridor(0, 18, 0.5), corridor(9, 27, 0.5, seed=1)
-    target = Surface(tilt.apply(target.points), target.colours, 0.05)
-    source = Surface(MOVED.apply(source.points), source.colours, 0.05)
-    best, _ = Repetition(target, source, along @ true, UP).elsewhere()[0]
+    repetition, true = pair(0.5, ALONG)
+    best, _ = repetition.elsewhere()[0]
     np.testing.assert_allclose(best.apply(MOVED.translation), true.apply(MOVED.translation), atol=0.15)
     np.testing.assert_allclose(best.rotation, true.rotation, atol=1e-6)
 
