@@ -212,7 +212,21 @@ def test_every_verb_prints_its_object_as_json(verb: str, gsmap_run: Callable[[st
 
 def test_the_contract_of_scenes_and_edges_stands(site: Path, cli: Run) -> None:
     scenes = {row["name"]: row for row in cli("list", site, "scenes", "--json").json["scenes"]}
-    assert list(scenes["left"])[:3] == ["id", "name", "num_gaussians"]
+    assert list(scenes["left"])[:13] == [
+        "id",
+        "name",
+        "num_gaussians",
+        "sh_degree",
+        "num_cameras",
+        "bounds",
+        "scale_policy",
+        "captured_at",
+        "ingested_at",
+        "world",
+        "crs",
+        "heights",
+        "offset",
+    ]
     assert np.shape(scenes["left"]["S_map_scene"]) == (4, 4)
     assert scenes["left"]["component"] == scenes["right"]["component"] != scenes["odd:one"]["component"]
     edges = cli("list", site, "edges", "--json").json["edges"]
