@@ -40,7 +40,7 @@ class GsmapError(Exception):
 
     Args:
         args: the message.
-        code: the cause in lower_snake_case for programs, a key of `gsmap.reason_codes.ERRORS`; default: that of the
+        code: the cause in lower_snake_case for programs, listed in docs/reference/json.md; default: that of the
             class. Codes stay as they are from version to version, messages do not.
     """
 

@@ -17,7 +17,7 @@ def raises(
     code: str | tuple[str, ...],
     match: str | None = None,
 ) -> Iterator[pytest.ExceptionInfo[GsmapError]]:
-    """Expect a gsmap error of a class with a code of `gsmap.reason_codes.ERRORS`.
+    """Expect a gsmap error of a class with a code of `tools.make.error_codes.ERRORS`.
 
     Args:
         kind: the class or classes.

@@ -19,11 +19,12 @@ import typer.main
 
 from gsmap.cli.app import build, outputs
 from gsmap.cli.console import Output
-from gsmap.reason_codes import ERRORS, REASONS
+from gsmap.reason_codes import REASONS
 from gsmap.settings import field_docs
 from gsmap.types.rows.base import SCHEMA, Row
 from gsmap.types.sim3 import Sim3
 from tools.harness import argument_parser
+from tools.make.error_codes import ERRORS
 
 
 def page() -> str:
