@@ -10,10 +10,9 @@ import pytest
 from raising import raises
 
 from gsmap.cli.edge import read_pose
-from gsmap.errors import ConfigError, GsmapError, InputError
+from gsmap.errors import ConfigError, InputError
 from gsmap.export import streamed_sog, tileset
 from gsmap.export.manifest import Manifest
-from gsmap.formats import g2o
 from gsmap.map.evaluation import _read_truth
 from gsmap.map.settings import map_settings
 from gsmap.settings import parse
@@ -90,12 +89,10 @@ def test_settings(tmp_path: Path, text: str) -> None:
     assert parse(f"{name}={value}")[0] == name
 
 
-def test_a_message_is_one_printable_line_whatever_it_quotes(tmp_path: Path) -> None:
-    (tmp_path / "a.g2o").write_text("VERTEX_SE3:QUAT\x1b]0;owned\x07 " + "word" * 5000 + " 1 2 3 4 5 6 7\n")
-    with pytest.raises(GsmapError) as caught:
-        g2o.read_graph(tmp_path / "a.g2o")
-    assert str(caught.value).isprintable()
-    assert len(str(caught.value)) <= 1000
+def test_a_message_is_one_printable_line_whatever_it_quotes() -> None:
+    quoted = str(InputError("hall\x1b]0;owned\x07\n" + "word" * 5000))
+    assert quoted.isprintable()
+    assert len(quoted) <= 1000
     said = str(InputError("x" * 5000 + " at line 3: " + "mend it"))
     assert said.endswith("at line 3: mend it")
     assert str(InputError(said)) == said

@@ -16,12 +16,11 @@ from raising import raises
 import gsmap.map
 from gsmap.errors import NotFoundError
 from gsmap.formats import read_cameras
-from gsmap.formats.g2o import read_graph
-from gsmap.formats.tum import read_trajectory
 from gsmap.geometry.camera_models import camera_model, pinhole_views
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.map import Map
 from gsmap.types import Cameras, Gaussians, Sim3
+from tools.pose_graph_files import read_g2o, read_tum
 
 NAMES = ["walk", "attic", "cellar", "den", "barn"]  # not in the order of names
 SIGMAS = np.array([0.001] * 6 + [1e-9])
@@ -67,7 +66,7 @@ def written(m: Map, out: Path) -> dict[str, tuple[float, np.ndarray]]:
     """The time and position of each name of a TUM file, by the comment before each pose."""
     m.write_poses(out, "tum")
     lines = [line for line in out.read_text().splitlines() if line]
-    poses = dict(zip([i for i, line in enumerate(lines) if line[0] != "#"], read_trajectory(out), strict=True))
+    poses = dict(zip([i for i, line in enumerate(lines) if line[0] != "#"], read_tum(out), strict=True))
     return {lines[i - 1].removeprefix("# "): (time_s, S.translation) for i, (time_s, S) in poses.items()}
 
 
@@ -131,7 +130,7 @@ def test_lengths_are_metres_where_the_metre_is_known(m, tmp_path, caplog):
 def test_a_g2o_in_metres_has_the_same_error_at_every_pose(m, tmp_path):
     def read(name: str):
         m.write_poses(tmp_path / name, "g2o")
-        return read_graph(tmp_path / name)
+        return read_g2o(tmp_path / name)
 
     units = read("units.g2o")
     m.edit("attic", metres_per_unit=0.5)

@@ -266,13 +266,13 @@ def disagreeing(world, seed: int) -> list:
 
 
 def run_g2o(task: dict) -> dict:
-    from gsmap.formats.g2o import read_graph
     from gsmap.geometry.similarities import Similarities
     from gsmap.optimize import Params, optimize
     from gsmap.optimize.gtsam_solve import objective
     from gsmap.optimize.measurements import measurements
+    from tools.pose_graph_files import read_g2o
 
-    graph = read_graph(task["file"])
+    graph = read_g2o(Path(task["file"]))
     answer, seconds = timed(optimize, list(graph.poses), graph.edges, params=Params(marginals=False))
     poses = Similarities.stack([p.S_map_scene for p in answer.poses.values()])
     return {"error": objective(measurements(list(graph.poses), graph.edges), poses), "cpu_s": seconds}

@@ -23,7 +23,7 @@ from gsmap.errors import NotFoundError
 from gsmap.export.manifest import Manifest
 from gsmap.export.streamed_sog import StreamedSog
 from gsmap.export.tileset import Tiles3D
-from gsmap.formats import cameras_json, colmap, g2o, nerfstudio, tum
+from gsmap.formats import cameras_json, colmap, nerfstudio
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.ingest import find_captures, find_date
 from gsmap.ingest.dates import date_in_name
@@ -33,7 +33,7 @@ from gsmap.map.settings import map_settings, write_settings
 from gsmap.map.stages.register import read_pairs
 from gsmap.networks.file import refuse_external_data
 from gsmap.settings import parse
-from gsmap.types import Cameras, Edge, Gaussians, Sim3, Tile
+from gsmap.types import Cameras, Gaussians, Sim3, Tile
 from tools.check import fuzz_mutators as mutators
 
 
@@ -302,11 +302,6 @@ def dataparser(folder: Path) -> list[bytes]:
     return [json.dumps({"transform": [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3]], "scale": 0.25}).encode()]
 
 
-def pose_graph(path: Path) -> None:
-    poses = {"1": Sim3.identity(), "2": Sim3(np.eye(3), np.array([1.0, 2, 3]))}
-    g2o.write_graph(path, poses, [Edge("1", "2", poses["2"], np.eye(7))], ["1"])
-
-
 def manifest(folder: Path) -> list[bytes]:
     tile = Tile(
         "k",
@@ -417,8 +412,6 @@ TARGETS: dict[str, Target] = {
     "colmap_images_txt": Target(
         "images.txt", colmap_txt("images.txt"), cameras_beside, setup=lambda f: colmap.write(f, cameras())
     ),
-    "g2o": Target("in.g2o", one(pose_graph), g2o.read_graph),
-    "tum": Target("in.tum", one(lambda p: tum.write_trajectory(p, [Sim3.identity()] * 3)), tum.read_trajectory),
     "date_sidecar": Target("hall.json", lambda _: SIDECAR, dated, JSON, hall),
     "date_jpeg": Target("images/a.jpg", photograph("JPEG"), lambda p: dated(p.parent), setup=hall),
     "date_tiff": Target("images/a.tif", photograph("TIFF"), lambda p: dated(p.parent), setup=hall),
