@@ -11,8 +11,6 @@ from gsmap.geometry.camera_models import pinhole_of, pinhole_views
 from gsmap.types import Cameras
 from gsmap.types.cameras import CameraModel
 
-_MIN_SHIFT_PX = 0.01
-
 
 def photo_cameras(cameras: Cameras) -> tuple[list[str], np.ndarray, list[CameraModel]]:
     """Return the names of the P photos that cameras show, their camera-to-frame poses (P, 4, 4) and their lenses."""

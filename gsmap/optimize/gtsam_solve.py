@@ -149,11 +149,3 @@ def _marginals(
     for scene in scenes.tolist():
         out[scene, :dim, :dim] = found.marginalCovariance(scene)
     return out
-
-
-def objective(edges: Measurements, poses: Similarities) -> float:
-    """Return the objective of the edges alone as GTSAM computes it: half the sum of their chi-squares."""
-    values = gtsam.Values()
-    for scene in np.unique(np.r_[edges.targets, edges.sources]).tolist():
-        values.insert(scene, to_gtsam(poses, scene, edges.dim))
-    return float(_factors(edges, edges.dim).error(values))

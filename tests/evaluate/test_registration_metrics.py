@@ -10,10 +10,10 @@ from gsmap.evaluate.registration import (
     absolute_trajectory_error,
     pose_error,
     scene_centroid,
-    summarise,
 )
 from gsmap.geometry.rotations import exp_so3
 from gsmap.types import Gaussians, Sim3
+from tools.bench.registration_summary import summarise
 
 
 def test_pose_error_matches_the_published_definitions():

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import os
 
+from tools.bench.registration_summary import summarise
 from tools.harness import argument_parser, timed
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -42,7 +43,7 @@ import numpy as np
 
 import gsmap.map
 from gsmap.evaluate.images import Lpips
-from gsmap.evaluate.registration import PoseError, pose_error, scene_centroid, summarise
+from gsmap.evaluate.registration import PoseError, pose_error, scene_centroid
 from gsmap.evaluate.renders import compare_renders, find_images
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.ingest import read_captures

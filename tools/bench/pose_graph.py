@@ -268,14 +268,15 @@ def disagreeing(world, seed: int) -> list:
 def run_g2o(task: dict) -> dict:
     from gsmap.geometry.similarities import Similarities
     from gsmap.optimize import Params, optimize
-    from gsmap.optimize.gtsam_solve import objective
     from gsmap.optimize.measurements import measurements
+    from gsmap.optimize.robust import chi_squares
     from tools.pose_graph_files import read_g2o
 
     graph = read_g2o(Path(task["file"]))
     answer, seconds = timed(optimize, list(graph.poses), graph.edges, params=Params(marginals=False))
     poses = Similarities.stack([p.S_map_scene for p in answer.poses.values()])
-    return {"error": objective(measurements(list(graph.poses), graph.edges), poses), "cpu_s": seconds}
+    error = chi_squares(measurements(list(graph.poses), graph.edges), poses).sum() / 2
+    return {"error": float(error), "cpu_s": seconds}
 
 
 if __name__ == "__main__":

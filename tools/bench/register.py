@@ -23,6 +23,7 @@ from __future__ import annotations
 import os
 
 from tools import harness
+from tools.bench.registration_summary import summarise
 from tools.harness import argument_parser, say, timed
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -42,7 +43,7 @@ from scipy.stats import chi2
 import gsmap.map
 from gsmap.evaluate.calibration import nees_of_edge, truth_covariance
 from gsmap.evaluate.overlap import solid_centres, true_overlaps
-from gsmap.evaluate.registration import PoseError, pose_error, scene_centroid, summarise
+from gsmap.evaluate.registration import PoseError, pose_error, scene_centroid
 from gsmap.geometry.similarities import Similarities
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.ingest import read_captures
