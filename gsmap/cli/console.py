@@ -320,6 +320,16 @@ def _print(table: Any) -> None:
     Console(width=None if sys.stdout.isatty() else 200, highlight=False).print(table)
 
 
+def refuse_options(context: typer.Context, options: Sequence[str], what: str) -> None:
+    """Raise an error for the first of these options that a command was given."""
+    from gsmap.errors import ConfigError
+
+    given = (one for one in context.command.params if context.params[str(one.name)] not in (None, False))
+    names = {name for one in given for name in one.opts}
+    if useless := [option for option in options if option in names]:
+        raise ConfigError(f"{useless[0]} does not apply to {what}", code="conflicting_options")
+
+
 # --- maps ------------------------------------------------------------------------------------------------------------
 
 

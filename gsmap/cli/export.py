@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -21,6 +20,7 @@ from gsmap.cli.console import (
     opened,
     print_rows,
     print_table,
+    refuse_options,
     say,
 )
 from gsmap.cli.thin import parse_size
@@ -28,6 +28,11 @@ from gsmap.cli.thin import parse_size
 PANEL = "Export", 1
 OUTPUTS = {"export": Output("exports.ExportReport"), "export --for": Output("exports.SmallMapReport")}
 _SURVEY_SUFFIXES = (".las", ".laz", ".tif", ".tiff", ".geojson", ".dxf")
+_NOT_FOR_FILES = ("--tile-size", "--budget", "--provenance", "--uncompressed", "--up", "--wait")
+_NOT_FOR_PAGES = (
+    *("--bbox", "--merge", "--revision", "--component", "--steps", "--budget", "--provenance", "--uncompressed"),
+    *("--prefer", "--as-of", "--static", "--tile-size", "--up", "--crs", "--pixel-size"),
+)
 
 
 class Purpose(StrEnum):
@@ -41,6 +46,7 @@ class Up(StrEnum):
 
 
 def command(
+    context: typer.Context,
     map: MapPath,
     out: Annotated[
         str,
@@ -158,63 +164,24 @@ def command(
     Example: `gsmap export site.gsmap house`, then `gsmap export site.gsmap tiles --format 3dtiles`
     """
     if format == "html":
-        _write_page(
-            map,
-            out,
-            page_mb,
-            sets,
-            preset,
-            json,
-            asked={
-                "--bbox": bbox,
-                "--merge": merge,
-                "--revision": revision,
-                "--component": component,
-                "--steps": steps,
-                "--budget": budget,
-                "--provenance": provenance or None,
-                "--uncompressed": uncompressed or None,
-                "--prefer": prefer,
-                "--as-of": as_of,
-                "--static": static or None,
-                "--tile-size": tile_size,
-                "--up": up,
-                "--crs": crs,
-                "--pixel-size": pixel_size,
-            },
-        )
+        refuse_options(context, _NOT_FOR_PAGES, "--format html, which shows the captures without merging them")
+        _write_page(map, out, page_mb, sets, preset, json)
         return
-    if Path(out).suffix.lower() in _SURVEY_SUFFIXES and format is None and purpose is Purpose.view:
-        not_for_files = {
-            "--tile-size": tile_size,
-            "--budget": budget,
-            "--provenance": provenance or None,
-            "--uncompressed": uncompressed or None,
-            "--up": up,
-            "--wait": wait or None,
-        }
-        _refuse_options(not_for_files, f"a {Path(out).suffix} file")
-        with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
-            report = m.export_survey(
-                out,
-                crs=crs,
-                pixel_size=pixel_size,
-                bbox=bbox,
-                merge=merge,
-                revision=revision,
-                component=component,
-                steps=steps,
-                prefer=prefer,
-                as_of=as_of,
-                static=static,
-            )
-        for note in report.notes:
-            say(note)
-        if json:
-            print_rows("export", report, json)
-        say(f"wrote {out}")
-        return
-    _refuse_options({"--crs": crs, "--pixel-size": pixel_size}, "tiles; name a file that ends in .laz or .tif")
+    is_survey = Path(out).suffix.lower() in _SURVEY_SUFFIXES and format is None and purpose is Purpose.view
+    if is_survey:
+        refuse_options(context, _NOT_FOR_FILES, f"a {Path(out).suffix} file")
+    else:
+        refuse_options(context, ("--crs", "--pixel-size"), "tiles; name a file that ends in .laz or .tif")
+    content: dict[str, Any] = {
+        "bbox": bbox,
+        "merge": merge,
+        "revision": revision,
+        "component": component,
+        "steps": steps,
+        "prefer": prefer,
+        "as_of": as_of,
+        "static": static,
+    }
     with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         if purpose is Purpose.localize:
             small = m.export_small(out, parse_size(budget or "50MB"), static=static)
@@ -224,26 +191,27 @@ def command(
             print_table(f"small map in {out}", small.scenes[0].columns, small.scenes)
             say(f"{small.num_bytes / 1e6:.2f} MB; run: gsmap localize {out} PHOTO")
             return
-        report = m.export(
-            out,
-            format=format,
-            tile_size_m=tile_size,
-            bbox=bbox,
-            merge=merge,
-            revision=revision,
-            component=component,
-            steps=steps,
-            budget_s=None if budget is None else _seconds(budget),
-            provenance=provenance,
-            uncompressed=uncompressed,
-            prefer=prefer,
-            as_of=as_of,
-            static=static,
-            up=up,
-            wait=wait,
-        )
+        if is_survey:
+            report = m.export_survey(out, crs=crs, pixel_size=pixel_size, **content)
+        else:
+            report = m.export(
+                out,
+                format=format,
+                tile_size_m=tile_size,
+                budget_s=None if budget is None else _seconds(budget),
+                provenance=provenance,
+                uncompressed=uncompressed,
+                up=up,
+                wait=wait,
+                **content,
+            )
     for note in report.notes:
         say(note)
+    if is_survey:
+        if json:
+            print_rows("export", report, json)
+        say(f"wrote {out}")
+        return
     about: dict[str, list[str]] = {}
     for tile in report.tiles:
         for note in tile.notes:
@@ -260,13 +228,10 @@ def command(
     say(f"{counts}; {'z is up' if report.up == 'z' else 'y is vertical, as viewers of the format expect'}")
 
 
-def _write_page(
-    map: str, out: str, megabytes: float, sets: Sets, preset: Preset, json: bool, asked: Mapping[str, object]
-) -> None:
+def _write_page(map: str, out: str, megabytes: float, sets: Sets, preset: Preset, json: bool) -> None:
     """Write the page with the unmerged captures of the map as one file."""
     from gsmap.types.rows.exports import ExportReport
 
-    _refuse_options(asked, "--format html, which shows the captures without merging them")
     with opened(map, bars=True, sets=sets, preset=preset) as m:
         written = m.write_page(out, megabytes=megabytes)
     for note in written.notes:
@@ -275,13 +240,6 @@ def _write_page(
         report = ExportReport(out=out, tiles=(), recomputed=0, reused=0, removed=0, notes=written.notes)
         print_rows("export", report, json)
     say(f"{written.num_bytes:,} bytes in {out}: open it in a browser")
-
-
-def _refuse_options(given: Mapping[str, object], what: str) -> None:
-    from gsmap.errors import ConfigError
-
-    if useless := [option for option, value in given.items() if value is not None]:
-        raise ConfigError(f"{useless[0]} does not apply to {what}", code="conflicting_options")
 
 
 def _seconds(text: str) -> float:

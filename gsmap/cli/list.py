@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, AsOf, MapPath, Output, opened, print_rows, say, say_heights
+from gsmap.cli.console import AsJson, AsOf, MapPath, Output, opened, print_rows, refuse_options, say, say_heights
 
 if TYPE_CHECKING:
     from gsmap.map import Map
@@ -33,6 +33,7 @@ class ListKind(StrEnum):
 
 
 def command(
+    context: typer.Context,
     map: MapPath,
     what: Annotated[ListKind, typer.Argument(help="Kind of rows to list.")],
     component: Annotated[
@@ -68,6 +69,9 @@ def command(
     """
     from gsmap.map.date_filter import undated_note
 
+    if what not in (ListKind.scenes, ListKind.edges):
+        other = "--component" if what is ListKind.revisions else "--after"
+        refuse_options(context, ("--status", other, "--tag", "--as-of"), what)
     with opened(map) as m:
         rows = _rows(m, what, component, status, after, tag, as_of)
         left_out = undated_note(m.scenes(), as_of) if as_of is not None else ""
@@ -87,20 +91,10 @@ def _rows(
     tag: str | None,
     as_of: str | None,
 ) -> Sequence[Row]:
-    from gsmap.errors import ConfigError
-
     if what is ListKind.scenes:
         return m.scene_rows(component=component, status=status, after=after, tag=tag, as_of=as_of)
     if what is ListKind.edges:
         return m.edge_rows(component=component, status=status, after=after, tag=tag, as_of=as_of)
-    useless: dict[str, object]
-    if what in (ListKind.tiles, ListKind.photos):
-        useless = {"--status": status, "--after": after, "--tag": tag, "--as-of": as_of}
-    else:
-        useless = {"--status": status, "--component": component, "--tag": tag, "--as-of": as_of}
-    for option, value in useless.items():
-        if value is not None:
-            raise ConfigError(f"{option} does not apply to {what}", code="conflicting_options")
     if what is ListKind.photos:
         return [row for row in m.photo_rows() if component is None or row.component == component]
     if what is ListKind.tiles:

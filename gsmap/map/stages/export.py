@@ -79,32 +79,16 @@ class Request:
 
     def options(self) -> list[str]:
         """Return the command-line options of ``gsmap export`` for this request."""
-        default = Request()
         words: list[str] = []
-        for name, option in _OPTIONS.items():
-            value = getattr(self, name)
-            if value != getattr(default, name):
-                values = [] if value is True else value if name == "bbox" else [value]
-                words += [option, *(shlex.quote(str(item)) for item in values)]
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if value != one.default:
+                values = [] if value is True else value if one.name == "bbox" else [value]
+                option = one.name.removesuffix("_m").removesuffix("_s").replace("_", "-")  # without the unit
+                words += [f"--{option}", *(shlex.quote(str(item)) for item in values)]
         return words
 
 
-_OPTIONS = {
-    "format": "--format",
-    "tile_size_m": "--tile-size",
-    "bbox": "--bbox",
-    "merge": "--merge",
-    "revision": "--revision",
-    "component": "--component",
-    "steps": "--steps",
-    "budget_s": "--budget",
-    "provenance": "--provenance",
-    "uncompressed": "--uncompressed",
-    "prefer": "--prefer",
-    "as_of": "--as-of",
-    "static": "--static",
-    "up": "--up",
-}
 _TILES_SHARE = 0.8  # of an export's time, where a tree is written over the tiles
 
 
