@@ -1,4 +1,4 @@
-"""Back up and restore a map, and report the results as rows."""
+"""Back up and restore a map."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 
 from gsmap.errors import ConfigError, CorruptError
 from gsmap.ingest import parse_date
-from gsmap.store import Store, schema
+from gsmap.store import Store
 from gsmap.store import backup as _backup
 from gsmap.store.storage import open_storage
 from gsmap.types.progress import Progress, silent
@@ -18,17 +18,7 @@ def save(
     store: Store, target: str | os.PathLike[str], *, verify: bool, keep: int | None, progress: Progress = silent
 ) -> BackupReport:
     """Back up a map to a target (``gsmap backup MAP DEST``); see `gsmap.store.backup.save`."""
-    made = _backup.save(store, open_storage(target), verify=verify, keep=keep, progress=progress)
-    return BackupReport(
-        dest=made.target,
-        snapshot=snapshot_row(made.snapshot),
-        num_files_new=made.num_files_new,
-        deleted=made.deleted,
-        num_bytes_freed=made.num_bytes_freed,
-        num_verified=made.num_verified,
-        problems=made.problems,
-        notes=made.notes,
-    )
+    return _backup.save(store, open_storage(target), verify=verify, keep=keep, progress=progress)
 
 
 def snapshots(target: str | os.PathLike[str]) -> tuple[list[SnapshotRow], list[str]]:
@@ -41,7 +31,7 @@ def snapshots(target: str | os.PathLike[str]) -> tuple[list[SnapshotRow], list[s
     rows, problems = list[SnapshotRow](), list[str]()
     for name in backup.names():
         try:
-            rows.append(snapshot_row(backup.snapshot(name)))
+            rows.append(backup.snapshot(name).row())
         except CorruptError as error:
             problems.append(str(error))
     return rows, problems
@@ -56,28 +46,7 @@ def restore(
     progress: Progress = silent,
 ) -> RestoreReport:
     """Restore a map from a backup (``gsmap restore DEST MAP``); see `gsmap.store.backup.restore`."""
-    made = _backup.restore(open_storage(target), path, **_moment(at), catalog_url=catalog_url, progress=progress)
-    return RestoreReport(
-        path=str(path),
-        snapshot=snapshot_row(made.snapshot),
-        catalog_schema=made.schema,
-        needs_migration=made.schema < schema.HEAD,
-    )
-
-
-def snapshot_row(one: _backup.Snapshot) -> SnapshotRow:
-    return SnapshotRow(
-        snapshot=one.name,
-        created_at=one.created_at,
-        map_id=one.map_id,
-        revision=one.revision,
-        counts=one.counts,
-        num_files=one.num_files,
-        num_bytes=one.num_bytes,
-        num_bytes_new=one.num_bytes_new,
-        catalog_schema=one.schema,
-        gsmap_version=one.gsmap_version,
-    )
+    return _backup.restore(open_storage(target), path, **_moment(at), catalog_url=catalog_url, progress=progress)
 
 
 def _moment(at: str | None) -> dict[str, str | None]:

@@ -67,7 +67,7 @@ def test_a_restored_map_holds_what_was_saved(kind, tmp_path, place, request):
     before = holdings(tmp_path / "m")
     with Store.open(tmp_path / "m") as store:
         made = save(store, place)
-        assert [(b.target, b.snapshot) for b in store.backups.list()] == [(str(place.root), made.snapshot.name)]
+        assert [(b.target, b.snapshot) for b in store.backups.list()] == [(str(place.root), made.snapshot.snapshot)]
     assert made.snapshot.revision == 1
     assert made.snapshot.counts["scenes"] == 2
     restored = restore(place, tmp_path / "r")
@@ -300,17 +300,17 @@ def test_verify_mends_what_the_map_has_and_tells_the_rest(filled, place, tmp_pat
     for path in (lost, place.root / "objects" / here[:2] / here):
         flip(path)
     with raises(CorruptError, code="bytes_differ", match=f"{here}|{sha}"):
-        restore(place, tmp_path / "r", snapshot=first.name)
+        restore(place, tmp_path / "r", snapshot=first.snapshot)
     assert not (tmp_path / "r").exists()
     said = save(filled, place, verify=True)
     assert said.num_verified == len(objects(place)) - 2  # what it sent itself, it did not read again
     assert len(said.problems) == 1
     assert sha in said.problems[0]
-    assert first.name in said.problems[0]
+    assert first.snapshot in said.problems[0]
     restore(place, tmp_path / "r")
     assert holdings(tmp_path / "r") == holdings(filled.catalog.folder)
     with raises(CorruptError, code="bytes_differ", match=sha):
-        restore(place, tmp_path / "r2", snapshot=first.name)
+        restore(place, tmp_path / "r2", snapshot=first.snapshot)
     lost.unlink()
     assert [sha in problem for problem in save(filled, place, verify=True).problems] == [True]
 
@@ -325,15 +325,16 @@ def test_keep_deletes_old_snapshots_and_what_only_they_needed(filled, place, tmp
     filled.prune()
     shutil.copy(place.root / "gsmap-backup.json", place.root / "objects" / "note.txt")  # not ours
     made = save(filled, place, keep=2)
-    assert made.deleted == (first.name,)
-    assert Backup.at(place).names() == [second.name, made.snapshot.name]
+    assert made.deleted == (first.snapshot,)
+    assert Backup.at(place).names() == [second.snapshot, made.snapshot.snapshot]
     assert (place.root / "objects" / old[:2] / old).is_file()
     made = save(filled, place, keep=1)
     assert made.num_bytes_freed > 0
-    assert Backup.at(place).names() == [made.snapshot.name]
+    assert Backup.at(place).names() == [made.snapshot.snapshot]
     assert not (place.root / "objects" / old[:2] / old).exists()
     assert (place.root / "objects" / "note.txt").is_file()
-    needed = {f.sha256 for f in Backup.at(place).files(made.snapshot)} | {made.snapshot.files}
+    kept = Backup.at(place).find()
+    needed = {f.sha256 for f in Backup.at(place).files(kept)} | {kept.files}
     assert {p.name for p in objects(place)} - {"note.txt"} == needed
     restore(place, tmp_path / "r")
     assert holdings(tmp_path / "r") == holdings(filled.catalog.folder)
@@ -348,20 +349,20 @@ def test_the_snapshot_just_made_stays_and_is_the_newest_though_a_clock_was_ahead
     filled.scenes.add(make_gaussians(seed=7), make_cameras(), name="new")
     second, third = save(filled, place), save(filled, place)
     assert any("clock" in note for note in second.notes)
-    assert Backup.at(place).names() == [ahead.name, second.snapshot.name, third.snapshot.name]
+    assert Backup.at(place).names() == [ahead.snapshot, second.snapshot.snapshot, third.snapshot.snapshot]
     last = save(filled, place, keep=1)
-    assert Backup.at(place).names() == [last.snapshot.name]
+    assert Backup.at(place).names() == [last.snapshot.snapshot]
     restore(place, tmp_path / "r")
     assert holdings(tmp_path / "r") == holdings(filled.catalog.folder)
 
 
 def test_a_snapshot_that_another_dates_later_meanwhile_does_not_end_the_one_just_made(filled, place, monkeypatch):
     made = save(filled, place).snapshot
-    later = replace(made, created_at="2190-01-01T00:00:00.000000+00:00")
+    later = replace(Backup.at(place).find(), created_at="2190-01-01T00:00:00.000000+00:00")
     name, packed = later.packed()
     place.put(f"snapshots/{name}.json", [packed], len(packed))
-    assert sweep(Backup.at(place), 1, made=made.name)[0] == ()
-    assert Backup.at(place).names() == [made.name, name]
+    assert sweep(Backup.at(place), 1, made=made.snapshot)[0] == ()
+    assert Backup.at(place).names() == [made.snapshot, name]
 
 
 @pytest.mark.guards("data")
@@ -400,7 +401,7 @@ def test_every_snapshot_that_is_left_is_whole_wherever_a_sweep_ends(filled, plac
 def test_keep_deletes_nothing_when_a_snapshot_cannot_be_read(filled, place):
     save(filled, place)
     second = save(filled, place).snapshot
-    flip(place.root / "snapshots" / f"{second.name}.json")
+    flip(place.root / "snapshots" / f"{second.snapshot}.json")
     before = objects(place)
     with raises(CorruptError, code="backup_damaged"):
         save(filled, place, keep=2)
@@ -484,7 +485,7 @@ def test_two_backups_at_once(filled, place, tmp_path):
     assert errors == []
     assert len(Backup.at(place).names()) == 3
     for i, one in enumerate(made):
-        restore(place, tmp_path / f"r{i}", snapshot=one.snapshot.name)
+        restore(place, tmp_path / f"r{i}", snapshot=one.snapshot.snapshot)
         assert holdings(tmp_path / f"r{i}") == holdings(filled.catalog.folder)
 
 
@@ -547,15 +548,15 @@ def test_a_damaged_branch_is_named_and_left_out_and_nothing_older_goes(filled, p
     (problem,) = made.problems
     assert "branch bad" in problem
     assert made.deleted == ()
-    assert Backup.at(place).names() == [whole.name, made.snapshot.name]
+    assert Backup.at(place).names() == [whole.snapshot, made.snapshot.snapshot]
     restore(place, tmp_path / "now")
-    restore(place, tmp_path / "before", snapshot=whole.name)
+    restore(place, tmp_path / "before", snapshot=whole.snapshot)
     for folder, branches in ((tmp_path / "now", {"good"}), (tmp_path / "before", {"bad", "good"})):
         with Store.open(folder, "r") as store:
             assert {branch.name for branch in store.branches.list()} == branches
             assert store.check().ok
     filled.branches.delete("bad")
-    assert save(filled, place, keep=1).deleted == (whole.name, made.snapshot.name)
+    assert save(filled, place, keep=1).deleted == (whole.snapshot, made.snapshot.snapshot)
 
 
 def test_the_next_backup_removes_what_killed_ones_left(filled, place):
@@ -587,11 +588,11 @@ def test_a_restored_map_and_the_map_itself_in_one_place_are_told(filled, place, 
     filled.scenes.edit("a", name="later")
     second = save(filled, place)
     restore(place, tmp_path / "newest")
-    restore(place, tmp_path / "older", snapshot=first.snapshot.name)
+    restore(place, tmp_path / "older", snapshot=first.snapshot.snapshot)
     with Store.open(tmp_path / "newest") as store:
         third = save(store, place)
         assert third.notes == ()
-        assert {one.snapshot for one in store.backups.list()} >= {first.snapshot.name, second.snapshot.name}
+        assert {one.snapshot for one in store.backups.list()} >= {first.snapshot.snapshot, second.snapshot.snapshot}
     for store in (filled, Store.open(tmp_path / "older")):
         (note,) = save(store, place).notes
         assert "another copy of the map" in note

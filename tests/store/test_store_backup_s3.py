@@ -44,8 +44,9 @@ def test_a_restored_map_holds_what_was_saved(filled, place, tmp_path):
 
 
 def test_verify_and_keep(filled, place, tmp_path):
-    first = save(filled, place).snapshot
-    file = next(f for f in Backup.at(place).files(first) if f.path.endswith("arrays.zip"))
+    save(filled, place)
+    backup = Backup.at(place)
+    file = next(f for f in backup.files(backup.find()) if f.path.endswith("arrays.zip"))
     place.put(object_name(file.sha256), [b"x" * file.size_bytes], file.size_bytes)
     with raises(CorruptError, code="bytes_differ", match=file.sha256):
         restore(place, tmp_path / "r")
@@ -56,7 +57,7 @@ def test_verify_and_keep(filled, place, tmp_path):
     made = save(filled, place, keep=1)
     assert len(made.deleted) == 2
     assert made.num_bytes_freed > 0
-    needed = {f.sha256 for f in Backup.at(place).files(made.snapshot)} | {made.snapshot.files}
+    needed = {f.sha256 for f in backup.files(backup.find())} | {backup.find().files}
     assert {name.rpartition("/")[2] for name in place.list("objects/")} == needed
     assert place.list("leases/") == {}
     restore(place, tmp_path / "r2")

@@ -59,7 +59,7 @@ def test_a_purge_names_every_backup_that_holds_the_scene(site, tmp_path, scene_c
     with pytest.MonkeyPatch.context() as patch:
         if backup_clock:
             at(patch, backup_clock)
-        name = save(site, open_storage(str(tmp_path / "kept"))).snapshot.name
+        name = save(site, open_storage(str(tmp_path / "kept"))).snapshot.snapshot
     ((_, done),) = purge(site, "attic")
     assert [text.split()[-1] for text in done.receipt["backups"]] == [name]
 

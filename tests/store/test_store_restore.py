@@ -41,7 +41,7 @@ def test_a_state_by_time_or_name(site, place, tmp_path):
             time.sleep(0.01)
     for i, (snapshot, count) in enumerate(saved):
         for j, wanted in enumerate(
-            [{"snapshot": snapshot.name}, {"snapshot": snapshot.name[-16:][:9]}, {"at": snapshot.created_at}]
+            [{"snapshot": snapshot.snapshot}, {"snapshot": snapshot.snapshot[-16:][:9]}, {"at": snapshot.created_at}]
         ):
             restore(place, tmp_path / f"r{i}{j}", **wanted)
             with Store.open(tmp_path / f"r{i}{j}", "r") as store:
@@ -49,7 +49,11 @@ def test_a_state_by_time_or_name(site, place, tmp_path):
     restore(place, tmp_path / "late", at="2999-01-01T00:00:00+00:00")
     with Store.open(tmp_path / "late", "r") as store:
         assert len(store.scenes.list()) == saved[-1][1]
-    for wanted in ({"at": "2001-01-01T00:00:00+00:00"}, {"snapshot": "nonsense"}, {"snapshot": saved[0][0].name[:15]}):
+    for wanted in (
+        {"at": "2001-01-01T00:00:00+00:00"},
+        {"snapshot": "nonsense"},
+        {"snapshot": saved[0][0].snapshot[:15]},
+    ):
         with raises(NotFoundError, code="snapshot_not_found"):
             restore(place, tmp_path / "r", **wanted)
     assert not (tmp_path / "r").exists()
@@ -114,8 +118,9 @@ def test_nobody_is_at_work_on_a_restored_map(site, place, tmp_path):
 @pytest.mark.guards("data")
 def test_a_damaged_object_is_never_restored(site, place, tmp_path, harm):
     with Store.open(site) as store:
-        made = save(store, place).snapshot
-    file = next(f for f in Backup.at(place).files(made) if f.path.endswith("arrays.zip"))
+        save(store, place)
+    backup = Backup.at(place)
+    file = next(f for f in backup.files(backup.find()) if f.path.endswith("arrays.zip"))
     path = place.root / object_name(file.sha256)
     data = bytearray(path.read_bytes())
     if harm == "flip":
@@ -264,7 +269,7 @@ def test_an_older_schema_is_restored_and_asks_to_be_migrated(site, tmp_path, pla
     with Store.open(site) as store:
         save(store, place)
     next_schema.install(tmp_path / "migrations")
-    assert restore(place, tmp_path / "r").schema < next_schema.NUMBER
+    assert restore(place, tmp_path / "r").catalog_schema < next_schema.NUMBER
     with raises(SchemaVersionError, code="map_too_old"):
         Store.open(tmp_path / "r")
     assert Store.migrate(tmp_path / "r")[1] == next_schema.NUMBER

@@ -1,7 +1,7 @@
 """Backup, restore and clone maps: snapshots of content-addressed files in a folder or an object store."""
 
 from gsmap.store.backup.repository import Backup, Snapshot
-from gsmap.store.backup.restoring import RestoreResult, clone, restore
-from gsmap.store.backup.saving import BackupResult, save
+from gsmap.store.backup.restoring import clone, restore
+from gsmap.store.backup.saving import save
 
-__all__ = ["Backup", "BackupResult", "RestoreResult", "Snapshot", "clone", "restore", "save"]
+__all__ = ["Backup", "Snapshot", "clone", "restore", "save"]

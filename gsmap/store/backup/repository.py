@@ -24,6 +24,7 @@ from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.map_state import check_path, verify_chunks
 from gsmap.store.catalog import timestamp_after
 from gsmap.store.storage import Storage, open_storage
+from gsmap.types.rows.backups import SnapshotRow
 from gsmap.version import __version__
 
 FORMAT = 1
@@ -67,6 +68,11 @@ class Snapshot:
     def time(self) -> str:
         """Return ``created_at`` in the format of names."""
         return _compact(self.created_at)
+
+    def row(self) -> SnapshotRow:
+        """Return what verbs print of the snapshot."""
+        row = {name: value for name, value in vars(self).items() if not name.startswith("files")}
+        return SnapshotRow(snapshot=row.pop("name"), catalog_schema=row.pop("schema"), **row)
 
     def packed(self) -> tuple[str, bytes]:
         """Return the name of the snapshot's file, which follows from its bytes, and the bytes."""

@@ -10,7 +10,6 @@ import shutil
 import uuid
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 from sqlalchemy import delete, insert, inspect, select
@@ -29,26 +28,11 @@ from gsmap.store.error_translation import translate_errors
 from gsmap.store.storage import Storage
 from gsmap.store.store import Store
 from gsmap.types.progress import Progress, silent
-from gsmap.types.rows.backups import CloneReport
+from gsmap.types.rows.backups import CloneReport, RestoreReport
 from gsmap.version import __version__
 
 _TRIES = 4  # attempts while other processes prune
 _log = logging.getLogger("gsmap.store")
-
-
-@dataclass(frozen=True)
-class RestoreResult:
-    """A restored map.
-
-    Args:
-        path: of the map.
-        snapshot: that it was restored from.
-        schema: of its catalog; older than this gsmap's if it needs ``gsmap migrate``.
-    """
-
-    path: Path
-    snapshot: Snapshot
-    schema: str
 
 
 def restore(
@@ -59,7 +43,7 @@ def restore(
     at: str | None = None,
     catalog_url: str | None = None,
     progress: Progress = silent,
-) -> RestoreResult:
+) -> RestoreReport:
     """Restore a map from a backup; it appears whole or not at all, with the id of the original.
 
     Args:
@@ -90,7 +74,12 @@ def restore(
         _confirm(target)
     if catalog_url is not None:
         trust.trust_new_map(target)
-    return RestoreResult(target, chosen, state.schema)
+    return RestoreReport(
+        path=str(path),
+        snapshot=chosen.row(),
+        catalog_schema=state.schema,
+        needs_migration=state.schema < schema.HEAD,
+    )
 
 
 def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silent) -> CloneReport:

@@ -26,40 +26,16 @@ from gsmap.store.backup.repository import OBJECTS, SNAPSHOTS, Backup, Snapshot, 
 from gsmap.store.storage import FolderStorage, Storage
 from gsmap.store.store import Store
 from gsmap.types.progress import Progress, silent
+from gsmap.types.rows.backups import BackupReport
 from gsmap.version import __version__
 
 TRANSFERS = 8  # concurrent transfers, because of the latency of remote storage
 _TRIES = 4  # attempts while other processes prune; they are paused for the last one
 
 
-@dataclass(frozen=True)
-class BackupResult:
-    """Result of a backup.
-
-    Args:
-        target: folder or URL of the backup.
-        snapshot: the new one.
-        num_files_new: number of objects sent.
-        deleted: names of the snapshots deleted.
-        num_bytes_freed: size of the objects deleted.
-        num_verified: number of objects read again; None without verification.
-        problems: damaged branches that were left out, and damage in the backup that could not be repaired from the map.
-        notes: remarks for the user.
-    """
-
-    target: str
-    snapshot: Snapshot
-    num_files_new: int
-    deleted: tuple[str, ...] = ()
-    num_bytes_freed: int = 0
-    num_verified: int | None = None
-    problems: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-
-
 def save(
     store: Store, storage: Storage, *, verify: bool = False, keep: int | None = None, progress: Progress = silent
-) -> BackupResult:
+) -> BackupReport:
     """Back up a map while other processes read and write it.
 
     Args:
@@ -94,10 +70,10 @@ def save(
         problems = run.remaining_problems(found) if found is not None else ()
     notes = (*run.notes, *run.note(snapshot, before))
     problems = (*run.problems, *problems)
-    saved = BackupResult(
-        storage.url,
-        snapshot,
-        run.num_sent,
+    saved = BackupReport(
+        dest=storage.url,
+        snapshot=snapshot.row(),
+        num_files_new=run.num_sent,
         num_verified=None if found is None else found.num_read,
         problems=problems,
         notes=notes,
