@@ -40,6 +40,13 @@ def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return matrix
 
 
+def median_direction(directions: np.ndarray) -> np.ndarray | None:
+    """Return the direction (3,) of the median of unit vectors (N, 3); None without vectors, or if they cancel out."""
+    middle = np.median(directions, axis=0) if len(directions) else np.zeros(3)
+    size = float(np.linalg.norm(middle))
+    return middle / size if size > 1e-3 else None
+
+
 def fibonacci_sphere(count: int) -> np.ndarray:
     """Return (count, 3) unit vectors spread evenly over the sphere (golden spiral), from +z downwards."""
     k = np.arange(count) + 0.5

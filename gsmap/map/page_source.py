@@ -7,7 +7,7 @@ import threading
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,18 +16,19 @@ from gsmap.geometry.transforms import transform_poses
 from gsmap.map import reports
 from gsmap.map.changes import change_row, changes_report, parse_change_id
 from gsmap.map.comparison_pictures import PairRenderer, num_views, pair_views
+from gsmap.map.edge_entries import edge_entries
 from gsmap.map.floor_plans import MAX_GAUSSIANS, MAX_SCENES, box_of, plan_of_component, read_scene
 from gsmap.map.metric_scales import map_metres
 from gsmap.map.object_pictures import ObjectPictures
 from gsmap.map.objects import MapObjects, compute_objects, history_report, objects_report
 from gsmap.map.page_pairs import pair_detail
 from gsmap.map.photos import photo_rows
+from gsmap.map.reports.common import up_directions
 from gsmap.map.reports.one_pair import is_one_pair, scenes_by_one_pair
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.map.stages.change import ComparisonPlan, missing_comparisons, plan_comparisons
 from gsmap.map.stages.optimize import pose_basis
 from gsmap.methods import text_digest
-from gsmap.report.content import EdgeEntry
 from gsmap.store import Store, cache
 from gsmap.types import GaussianSource, PoseGraph, Prior, Scene
 from gsmap.types.plain import canonical
@@ -315,7 +316,8 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
     placed = store.revisions.get()
     poses = placed.poses if placed else {}
     graphs = store.graphs.list()
-    ups = {one.scene: np.array(one.up, np.float64) for one in graphs if one.up is not None}
+    living = store.scenes.list()
+    ups = up_directions(graphs, living)
     metres = map_metres(store, placed)
     told = {}
     for number, prior in store.priors.numbered():
@@ -324,8 +326,15 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
         told[prior.scene] = prior_words(prior, 1.0 if metre is None else metre.metres_per_unit), number
     alone = scenes_by_one_pair(store) if placed else set()
     scenes = [
-        _scene(scene, content_key(scene, TreeParams()), poses, ups, told, scene.id in alone)
-        for scene in store.scenes.list()
+        ViewScene(
+            scene,
+            content_key(scene, TreeParams()),
+            poses.get(scene.id),
+            ups.get(scene.id),
+            told.get(scene.id, (None, None)),
+            scene.id in alone,
+        )
+        for scene in living
     ]
     at = {entry.scene.id: place for place, entry in enumerate(scenes)}
     newest, given = store.revisions.newest(), pose_basis(store, settings)
@@ -375,21 +384,6 @@ def prior_words(prior: Prior, metres_per_unit: float) -> str:
     return ", ".join([what, *filter(None, known)])
 
 
-def _scene(
-    scene: Scene,
-    key: str,
-    poses: Mapping[str, Any],
-    ups: Mapping[str, np.ndarray],
-    told: Mapping[str, tuple[str, int]],
-    one_pair: bool,
-) -> ViewScene:
-    up = ups.get(scene.id)
-    if up is None and scene.thinning is not None and scene.thinning.up is not None:
-        up = np.array(scene.thinning.up, np.float64)
-    prior, number = told.get(scene.id, (None, None))
-    return ViewScene(scene, key, poses.get(scene.id), up, prior, number, one_pair)
-
-
 def content_key(scene: Scene, tree: TreeParams) -> str:
     """Return the key of a scene's levels of detail. It begins with the scene's id, and changes when the scene is
     thinned or its levels are computed in another way.
@@ -399,21 +393,12 @@ def content_key(scene: Scene, tree: TreeParams) -> str:
 
 
 def _edges(store: Store, placed: PoseGraph | None, at: Mapping[str, int]) -> list[contract.EdgeEntry]:
-    outcomes = placed.outcomes if placed else {}
-    current = {(one.registration.target, one.registration.source): one for one in store.registrations.current()}
-    out: list[contract.EdgeEntry] = []
-    for row in reports.edge_rows(store):
-        pair = (row.target, row.source)
-        if not at.keys() >= {*pair}:
+    outcomes, out = placed.outcomes if placed else {}, list[contract.EdgeEntry]()
+    for entry, stored in edge_entries(store, placed):
+        row, outcome = entry.row, outcomes.get((entry.row.target, entry.row.source))
+        if not at.keys() >= {row.target, row.source}:
             continue
-        stored, outcome = current.get(pair), outcomes.get(pair)
-        probability = float("nan") if stored is None else stored.registration.evidence.get("probability", float("nan"))
-        known = float(probability) if np.isfinite(probability) else None
-        note = ""
-        if row.review is not None:
-            words = store.registrations.reviews(*pair)
-            note = words[-1].note if words else ""
-        chi2 = None if outcome is None else outcome.residual_chi2
+        words = [] if row.review is None else store.registrations.reviews(row.target, row.source)
         out.append(
             {
                 "target": at[row.target],
@@ -423,13 +408,13 @@ def _edges(store: Store, placed: PoseGraph | None, at: Mapping[str, int]) -> lis
                 "one_pair": outcome is not None and is_one_pair(outcome),
                 "undecided": row.undecided,
                 "review": row.review,
-                "note": note,
+                "note": words[-1].note if words else "",
                 "reason": row.reason,
-                "probability": known,
+                "probability": entry.probability,
                 "overlap": row.overlap if np.isfinite(row.overlap) else 0.0,
                 "num_inliers": row.num_inliers,
-                "doubt": EdgeEntry(row, chi2=chi2, probability=known).doubt,
-                "registration": None if stored is None else stored.number,
+                "doubt": entry.doubt,
+                "registration": stored.number,
                 "detail": f"edges/{row.target}-{row.source}.json",
             }
         )

@@ -16,15 +16,18 @@ import numpy as np
 
 from gsmap.durable import is_stream, write_text_output
 from gsmap.errors import ConfigError, CorruptError, NotFoundError
+from gsmap.geometry.directions import median_direction
 from gsmap.geometry.rotations import angle_between
 from gsmap.geometry.uncertainty import middle_covariance_m2
 from gsmap.map import reports
 from gsmap.map.changes import changes_report, filter_by_date
 from gsmap.map.comparison_pictures import PairRenderer, note_target, picture_of_pair
 from gsmap.map.date_filter import is_after, parse_moment
+from gsmap.map.edge_entries import edge_entries
 from gsmap.map.floor_plans import MAX_GAUSSIANS, MAX_SCENES, SceneArrays, box_of, plan_of_component, read_scene
 from gsmap.map.metric_scales import map_metres
 from gsmap.map.objects import load_objects, objects_report
+from gsmap.map.reports.common import up_directions
 from gsmap.map.settings import Settings
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.map.stages.change import plan_comparisons
@@ -45,7 +48,6 @@ from gsmap.report import (
     owner_of,
     page,
 )
-from gsmap.report.content import CHI2_999
 from gsmap.report.words import verdict
 from gsmap.store import Store
 from gsmap.store.quarantine import CAPTURE
@@ -147,9 +149,7 @@ class _CatalogState:
     graph: PoseGraph | None
     metres: dict[int, MetricScale]
     ups: dict[str, np.ndarray]
-    edges: list[EdgeRow]
-    registrations: dict[tuple[str, str], StoredRegistration]
-    revisions: list[RevisionRow]
+    edges: list[EdgeEntry]
     changes: ChangesReport | None
     report: Report
 
@@ -257,11 +257,12 @@ class _ReportBuilder:
         found = [reads[scene.id] for scene in scenes]
         place = {scene.id: i for i, scene in enumerate(scenes)}
         lines = [
-            PlanEdge(place[edge.row.target], place[edge.row.source], _on_plan(edge), _tip(edge))
+            PlanEdge(place[edge.row.target], place[edge.row.source], edge.kind, _tip(edge))
             for edge in edges
             if edge.row.target in place and edge.row.source in place and edge.use not in ("rejected", "no_match")
         ]
-        metre, up = island.metre.metres_per_unit, _up(state, scenes, poses)
+        ups = [pose.S_map_scene.rotation @ state.ups[pose.scene] for pose in poses if pose.scene in state.ups]
+        metre, up = island.metre.metres_per_unit, median_direction(np.array(ups))
         plan, note = plan_of_component(island.scenes, poses, found, lines, up, metre, _PLAN_PX)
         return replace(island, plan=plan, note=note)
 
@@ -329,8 +330,7 @@ def _state(store: Store, settings: Settings, since: str | None) -> _CatalogState
     when = None if since is None else parse_moment(since)
     scenes, graph = store.scenes.list(), store.revisions.get()
     metres = map_metres(store, graph)
-    stored = {(one.registration.target, one.registration.source): one for one in store.registrations.current()}
-    edges = reports.edge_rows(store)
+    edges = edge_entries(store, graph)
     revisions = reports.revision_rows(store)
     num_bytes = scene_sizes(store)
     found = status(store, settings)
@@ -350,17 +350,12 @@ def _state(store: Store, settings: Settings, since: str | None) -> _CatalogState
         changes=changes,
         objects=None if graph is None else _load_objects(store, settings),
         storage=tuple(StorageEntry(_KINDS.get(one.kind, one.kind), one.count, one.num_bytes) for one in sizes(store)),
-        seconds=_seconds(stored.values()),
-        news=None if when is None or since is None else _news(since, when, scenes, edges),
+        seconds=_seconds(stored for _, stored in edges),
+        news=None if when is None or since is None else _news(since, when, scenes, [entry.row for entry, _ in edges]),
         params=settings.report,
     )
-    ups = {one.scene: np.array(one.up, np.float64) for one in store.graphs.list() if one.up is not None}
-    ups |= {
-        scene.id: np.array(scene.thinning.up, np.float64)
-        for scene in scenes
-        if scene.thinning is not None and scene.thinning.up is not None and scene.id not in ups
-    }
-    return _CatalogState(found, scenes, graph, metres, ups, edges, stored, revisions, changes, shown)
+    ups = up_directions(store.graphs.list(), scenes)
+    return _CatalogState(found, scenes, graph, metres, ups, [entry for entry, _ in edges], changes, shown)
 
 
 def _known_changes(store: Store, settings: Settings, since: str | None) -> ChangesReport:
@@ -407,17 +402,9 @@ def _seconds(stored: Iterable[StoredRegistration]) -> dict[str, float]:
 def _edges(state: _CatalogState, reads: Mapping[str, SceneArrays]) -> list[EdgeEntry]:
     """Return every edge with its residual under the newest poses."""
     poses = state.graph.poses if state.graph else {}
-    outcomes = state.graph.outcomes if state.graph else {}
     out = []
-    for row in state.edges:
-        stored = state.registrations.get((row.target, row.source))
-        outcome = outcomes.get((row.target, row.source))
-        probability = float("nan") if stored is None else stored.registration.evidence.get("probability", float("nan"))
-        entry = EdgeEntry(
-            row,
-            chi2=None if outcome is None else outcome.residual_chi2,
-            probability=float(probability) if np.isfinite(probability) else None,
-        )
+    for entry in state.edges:
+        row = entry.row
         a, b = poses.get(row.target), poses.get(row.source)
         if a is not None and b is not None and a.component == b.component:
             entry = replace(entry, component=a.component)
@@ -432,34 +419,16 @@ def _edges(state: _CatalogState, reads: Mapping[str, SceneArrays]) -> list[EdgeE
     return out
 
 
-def _on_plan(edge: EdgeEntry) -> str:
-    return "strained" if edge.use == "used" and (edge.chi2 or 0.0) > CHI2_999 else edge.use
-
-
 def _tip(edge: EdgeEntry) -> str:
     chi2 = "" if edge.chi2 is None else f", chi2 {edge.chi2:.3g}"
     off = "" if edge.translation_m is None else f", off by {edge.translation_m:.3g} m"
-    return f"{edge.row.pair}: {_on_plan(edge)}{chi2}{off}"
+    return f"{edge.row.pair}: {edge.kind}{chi2}{off}"
 
 
 def _rotation_sigma_deg(pose: ScenePose) -> float | None:
     if pose.covariance is None:
         return None
     return float(np.degrees(np.sqrt(max(0.0, float(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])))))
-
-
-def _up(state: _CatalogState, scenes: Sequence[Scene], poses: Sequence[ScenePose]) -> np.ndarray | None:
-    """Return the median up direction of a component's scenes, in its frame; None if unknown."""
-    told = [
-        pose.S_map_scene.rotation @ state.ups[scene.id]
-        for scene, pose in zip(scenes, poses, strict=True)
-        if scene.id in state.ups
-    ]
-    if not told:
-        return None
-    middle = np.median(np.array(told), axis=0)
-    size = float(np.linalg.norm(middle))
-    return middle / size if size > 1e-3 else None
 
 
 # --- places of files -------------------------------------------------------------------------------------------------

@@ -83,14 +83,18 @@ class EdgeEntry:
         return "unused" if self.row.status == "accepted" else self.row.status
 
     @property
+    def kind(self) -> str:
+        """``strained`` for a used edge whose residual only one in a thousand correct edges exceeds, else its use."""
+        return "strained" if self.use == "used" and (self.chi2 or 0.0) > CHI2_999 else self.use
+
+    @property
     def doubt(self) -> float:
         """Urgency of a review in [0, 1]: undecided edges first, then edges that no cycle confirms, edges with residuals
         beyond their covariance, and excluded edges; within each group the less probable first. 0 after a review."""
         if self.row.review is not None:
             return 0.0
         unlikely = 1.0 - min(1.0, max(0.0, self.probability or 0.0))
-        is_strained = self.use == "used" and (self.chi2 or 0.0) > CHI2_999
-        low = {"undecided": 0.8, "tentative": 0.6, "unused": 0.2}.get(self.use, 0.4 if is_strained else None)
+        low = {"undecided": 0.8, "tentative": 0.6, "strained": 0.4, "unused": 0.2}.get(self.kind)
         return 0.0 if low is None else low + 0.19 * unlikely
 
 

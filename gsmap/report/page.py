@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.report import plots
-from gsmap.report.content import CHI2_999, EdgeEntry, Island, PoseDifferences, Report
+from gsmap.report.content import EdgeEntry, Island, PoseDifferences, Report
 from gsmap.report.draw_plan import draw_plan
 from gsmap.report.markup import Markup, Part, joined, tag
 from gsmap.report.top import picture_webp
@@ -374,13 +374,9 @@ def _matrix(report: Report) -> Markup:
     for edge in report.edges:
         a, b = place.get(edge.row.target), place.get(edge.row.source)
         if a is not None and b is not None:
-            kind = _strained_kind(edge)
-            cells.append((max(a, b), min(a, b), kind, f"{edge.row.pair}: {_LEGEND.get(kind, kind)}"))
+            tip = f"{edge.row.pair}: {_LEGEND.get(edge.kind, edge.kind)}"
+            cells.append((max(a, b), min(a, b), edge.kind, tip))
     return plots.matrix([known[i].name for i in order], cells, "Registered pairs of scenes")
-
-
-def _strained_kind(edge: EdgeEntry) -> str:
-    return "strained" if edge.use == "used" and (edge.chi2 or 0) > CHI2_999 else edge.use
 
 
 def _edge_table(report: Report) -> Markup:
@@ -407,11 +403,10 @@ def _edge_table(report: Report) -> Markup:
 
 
 def _edge_row(edge: EdgeEntry) -> tuple[Part, ...]:
-    kind = _strained_kind(edge)
     review = f", {edge.row.review}ed by a person" if edge.row.review else ""
     return (
         edge.row.pair,
-        tag("span", f"{kind.replace('_', ' ')}{review}", class_=f"tag {kind}"),
+        tag("span", f"{edge.kind.replace('_', ' ')}{review}", class_=f"tag {edge.kind}"),
         chi_square(edge.chi2),
         length(edge.translation_m),
         angle(edge.rotation_deg),

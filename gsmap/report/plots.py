@@ -28,8 +28,8 @@ def residual_bars(edges: Sequence[EdgeEntry]) -> Markup:
     for i, (edge, value) in enumerate(zip(chosen, values, strict=True)):
         y = frame.y_span[1] + _ROW * (i + 0.5)
         tip = f"{edge.row.pair}: chi2 {number(edge.chi2)}, off by {length(edge.translation_m)}"
-        parts.append(svg.line(x.start, y, x.at(value), y, f"stem {_kind(edge)}"))
-        parts.append(svg.dot(x.at(value), y, 4.5, f"mark {_kind(edge)}", tip))
+        parts.append(svg.line(x.start, y, x.at(value), y, f"stem {edge.kind}"))
+        parts.append(svg.dot(x.at(value), y, 4.5, f"mark {edge.kind}", tip))
         parts.append(svg.label(_NAMES - 6, y + 4, _ends(edge), "tick", anchor="end"))
     return svg.plot(frame, x, None, ("chi² of the residual (7 degrees of freedom)", ""), "Residual of each edge", parts)
 
@@ -50,11 +50,6 @@ def _expected(frame: Frame, x: Axis) -> Markup:
         at = x.at(value)
         out.append(svg.line(at, top, at, bottom, "limit", tag("title", f"{name} of correct edges lie below")))
     return joined(out)
-
-
-def _kind(edge: EdgeEntry) -> str:
-    is_strained = edge.use == "used" and edge.chi2 is not None and edge.chi2 > CHI2_999
-    return "strained" if is_strained else edge.use
 
 
 def residual_distribution(edges: Sequence[EdgeEntry]) -> Markup:
@@ -84,7 +79,7 @@ def offset_bars(edges: Sequence[EdgeEntry]) -> Markup:
     values = [max(e.translation_m or 0.0, 1e-5) for e in chosen]
     names = [_ends(e) for e in chosen]
     tips = [f"{e.row.pair}: {length(e.translation_m)}, {number(e.rotation_deg, 2)}°" for e in chosen]
-    kinds = [_kind(e) for e in chosen]
+    kinds = [e.kind for e in chosen]
     return _metre_bars(names, values, tips, kinds, "distance between edge and poses", "Residuals in metres")
 
 

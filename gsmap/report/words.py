@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Literal, assert_never
 
-from gsmap.report.content import CHI2_999, EdgeEntry, Report
+from gsmap.report.content import EdgeEntry, Report
 from gsmap.types.metric_scale import KnownBy, MetricScale
 from gsmap.types.rows.maps import TodoKind
 
@@ -244,8 +244,7 @@ def _next_step(report: Report) -> list[str]:
 
 def strained(edges: Sequence[EdgeEntry]) -> list[EdgeEntry]:
     """Return used edges with a chi-square above the 99.9 % quantile, largest first."""
-    found = [edge for edge in edges if edge.use == "used" and edge.chi2 is not None and edge.chi2 > CHI2_999]
-    return sorted(found, key=lambda edge: -(edge.chi2 or 0.0))
+    return sorted((edge for edge in edges if edge.kind == "strained"), key=lambda edge: -(edge.chi2 or 0.0))
 
 
 NOT_PULLED = 1e-6

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.geometry.boxes import box_around, box_corners
+from gsmap.geometry.directions import median_direction
 from gsmap.geometry.uncertainty import middle_covariance_m2
 from gsmap.types import Scene, ScenePose, Sim3
 from gsmap.types.plain import fields_of, plain
@@ -39,8 +40,7 @@ class ViewScene:
         key: Key of its current content, in addresses and in the cache.
         pose: Estimated pose; None if the scene is not placed, and a component of its own.
         up: (3,) direction opposite to gravity in the scene frame; None if unknown.
-        prior: Description of its pose prior; None if there is none.
-        prior_number: Number of that prior in the history of priors.
+        prior: Description of its pose prior and its number in the history of priors, or None for both.
         one_pair: The scene is tentative only because single pairs place it, which nothing contradicts.
     """
 
@@ -48,8 +48,7 @@ class ViewScene:
     key: str
     pose: ScenePose | None
     up: np.ndarray | None = None
-    prior: str | None = None
-    prior_number: int | None = None
+    prior: tuple[str | None, int | None] = (None, None)
     one_pair: bool = False
 
     @property
@@ -215,10 +214,8 @@ def up_of(scenes: Sequence[ViewScene]) -> list[float]:
     Default: z of the map, or `UNPLACED_UP` for a single scene without edges.
     """
     ups = [entry.S_map_scene.rotation @ entry.up for entry in scenes if entry.up is not None]
-    middle = np.median(np.array(ups), axis=0) if ups else np.zeros(3)
-    size = float(np.linalg.norm(middle))
-    if size > 1e-3:
-        return [float(value) for value in middle / size]
+    if (up := median_direction(np.array(ups))) is not None:
+        return [float(value) for value in up]
     is_alone = len(scenes) == 1 and (scenes[0].pose is None or scenes[0].pose.status == "isolated")
     return list(UNPLACED_UP) if is_alone else [0.0, 0.0, 1.0]
 
@@ -244,8 +241,8 @@ def _scene(
         "tileset": f"scenes/{entry.key}/tileset.json",
         "extras": f"scenes/{scene.id}/extras.json",
         "tags": list(scene.tags),
-        "prior": entry.prior,
-        "prior_number": entry.prior_number,
+        "prior": entry.prior[0],
+        "prior_number": entry.prior[1],
     }
     return {name: plain(value) for name, value in fields_of(scene, SceneFacts).items()} | placed
 

@@ -1,13 +1,17 @@
-"""Helpers for all reports: names by id, checked filters, pairs."""
+"""Helpers for all reports: names and directions by id, checked filters, pairs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NoReturn
 
+import numpy as np
+
 from gsmap.errors import ConfigError, CorruptError, NotFoundError
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
+from gsmap.store.graphs import StoredGraph
+from gsmap.store.scenes import SceneSummary
 from gsmap.types import Scene
 from gsmap.types.rows.scenes import SceneRef
 
@@ -31,6 +35,15 @@ class SceneMapping(dict[str, Any]):
             f"the catalog has results of scene {scene[:12]}, which it does not have: run gsmap check",
             code="catalog_invalid",
         )
+
+
+def up_directions(graphs: Iterable[StoredGraph], scenes: Iterable[Scene | SceneSummary]) -> dict[str, np.ndarray]:
+    """Return the up direction (3,) of scenes by id, in their own frames: that of the last graph in the list, or the
+    one kept when the scene was thinned. Scenes without a known direction are left out.
+    """
+    of_thinned = {scene.id: scene.thinning.up for scene in scenes if scene.thinning is not None}
+    chosen = of_thinned | {graph.scene: graph.up for graph in graphs}
+    return {scene: np.array(up, np.float64) for scene, up in chosen.items() if up is not None}
 
 
 def refs(scenes: Iterable[str], name_of: Mapping[str, str]) -> tuple[SceneRef, ...]:

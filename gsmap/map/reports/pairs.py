@@ -60,7 +60,7 @@ def edge_rows(
         inside = {row.id for row in scene_rows(store, component=component, tag=tag, as_of=as_of)}
     return [
         row
-        for row in _edge_rows(store, store.registrations.current(brief=True))
+        for row in rows_of_registrations(store, store.registrations.current(brief=True))
         if (inside is None or {row.target, row.source} <= inside)
         and (status is None or (EDGE_USES[status](row) if status in EDGE_USES else row.status == status))
         and (since is None or is_after(row.registered_at, since))
@@ -73,7 +73,7 @@ def edges_of_pairs(store: Store, pairs: Collection[tuple[str, str]]) -> list[Edg
     if not pairs:
         return []
     scenes = {scene for pair in pairs for scene in pair}
-    return _edge_rows(store, store.registrations.current_of_pairs(pairs), *sorted(scenes))
+    return rows_of_registrations(store, store.registrations.current_of_pairs(pairs), *sorted(scenes))
 
 
 @snapshot_read
@@ -89,15 +89,15 @@ def rows_of_edges(store: Store, made: Iterable[Registration]) -> list[EdgeRow]:
 def edge_row(store: Store, a: Scene, b: Scene) -> EdgeRow:
     """Return the current edge of a pair, or a row with the status ``never registered``."""
     current = store.registrations.get(a.id, b.id)
-    return EdgeRow(**_never_registered(a, b)) if current is None else _edge_rows(store, [current], a.id)[0]
+    return EdgeRow(**_never_registered(a, b)) if current is None else rows_of_registrations(store, [current], a.id)[0]
 
 
 def edges_of_scene(store: Store, scene: Scene) -> list[EdgeRow]:
     """List the current edge of every registered pair of a scene."""
-    return _edge_rows(store, store.registrations.current_of_scene(scene.id), scene.id)
+    return rows_of_registrations(store, store.registrations.current_of_scene(scene.id), scene.id)
 
 
-def _edge_rows(store: Store, edges: Iterable[StoredRegistration], *scenes: str) -> list[EdgeRow]:
+def rows_of_registrations(store: Store, edges: Iterable[StoredRegistration], *scenes: str) -> list[EdgeRow]:
     """Return the rows of registrations.
 
     Args:

@@ -13,6 +13,7 @@ import numpy as np
 
 from gsmap import optimize as solver
 from gsmap.map.date_filter import parse_moment
+from gsmap.map.reports.common import up_directions
 from gsmap.map.settings import Settings
 from gsmap.map.shared_jobs import POLL_S
 from gsmap.map.snapshot_read import snapshot_read
@@ -174,9 +175,7 @@ def _ups(store: Store, living: Sequence[SceneSummary], settings: Settings) -> di
     several = [scene for scene in living if times[scene.id] > 1]
     present = {key.digest for key in graph_keys(store, several, settings).values()} if several else set[str]()
     # Graphs come oldest first; the present one of a scene goes last.
-    chosen = {graph.scene: graph.up for graph in sorted(said, key=lambda graph: graph.key in present)}
-    of_thinned = {scene.id: scene.thinning.up for scene in living if scene.thinning is not None}
-    return {scene: np.array(up) for scene, up in (of_thinned | chosen).items() if up is not None}
+    return up_directions(sorted(said, key=lambda graph: graph.key in present), living)
 
 
 def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:
