@@ -70,7 +70,7 @@ def _draw(m: Map, path: Path) -> None:
     from PIL import Image
 
     from gsmap.durable import write_output
-    from gsmap.view.map_picture import map_picture
+    from gsmap_synthetic.map_picture import map_picture
 
     parts = [(scene.name, *m.read(scene.name, frame="map")) for scene in m.scenes()]
     edges = [(row.target_name, row.source_name) for row in m.edge_rows() if row.used]

@@ -20,21 +20,12 @@ _INK = (40, 42, 48)
 Part = tuple[str, Gaussians, Cameras]
 
 
-def map_picture(
-    parts: Sequence[Part],
-    edges: Sequence[tuple[str, str]] = (),
-    *,
-    up: np.ndarray | None = None,
-    title: str = "",
-    width_px: int = 1400,
-) -> np.ndarray:
+def map_picture(parts: Sequence[Part], edges: Sequence[tuple[str, str]] = (), *, width_px: int = 1400) -> np.ndarray:
     """Draw placed scenes: an oblique view without near walls, and a top view with camera paths and edges.
 
     Args:
         parts: (name, Gaussians, cameras) of each placed scene, in the map frame.
         edges: Pairs of names of scenes that edges connect.
-        up: (3,) direction opposite to gravity in the map frame; default: estimated from cameras and floors.
-        title: Title above the picture.
         width_px: Width of the picture; its content scales along.
 
     Returns:
@@ -47,9 +38,9 @@ def map_picture(
 
     if not parts:
         raise InputError("a picture of a map needs at least one placed scene", code="nothing_to_draw")
-    parts = _upright(parts, up)
+    parts = _upright(parts)
     unit = width_px / 1600
-    margin, head, foot = round(28 * unit), round((86 if title else 28) * unit), round(84 * unit)
+    margin, head, foot = round(28 * unit), round(28 * unit), round(84 * unit)
     split = round(0.585 * (width_px - 3 * margin))
     height = round(0.80 * split)
     panels = [(margin, split), (2 * margin + split, width_px - 3 * margin - split)]
@@ -62,15 +53,13 @@ def map_picture(
     for (x, _), view, full in zip(panels, views, (False, True), strict=True):
         _draw_walks(draw, parts, view, (x, head), unit, full)
     _draw_ties(draw, parts, edges, views[1], (panels[1][0], head), unit)
-    if title:
-        draw.text((margin, round(24 * unit)), title, fill=_INK, font=_font(34 * unit))
     _draw_legend(draw, parts, edges, (margin, head + height + round(24 * unit)), unit)
     return np.asarray(page)
 
 
-def _upright(parts: Sequence[Part], up: np.ndarray | None) -> list[Part]:
+def _upright(parts: Sequence[Part]) -> list[Part]:
     """Rotate the parts so that z is up, walls are along x and y, and the longer side is along x."""
-    up = _find_up(parts) if up is None else np.asarray(up, np.float64) / np.linalg.norm(up)
+    up = _find_up(parts)
     x = np.cross([0, 1.0, 0] if abs(up[1]) < 0.9 else [1.0, 0, 0], up)
     x /= np.linalg.norm(x)
     level = np.stack([x, np.cross(up, x), up])
