@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,9 +55,7 @@ def pose_error(estimated: Sim3, true: Sim3, source_centroid: np.ndarray) -> Pose
     )
 
 
-def absolute_trajectory_error(
-    estimated: np.ndarray, true: np.ndarray, *, align: str = "rigid", segments: Sequence[np.ndarray] | None = None
-) -> float:
+def absolute_trajectory_error(estimated: np.ndarray, true: np.ndarray, *, align: str = "rigid") -> float:
     """Return the absolute trajectory error (ATE): the root mean square distance between aligned estimated and true
     positions.
 
@@ -67,8 +64,6 @@ def absolute_trajectory_error(
     Args:
         estimated, true: (N, 3) positions in their own frames.
         align: ``rigid``, ``similarity`` or ``none``.
-        segments: index arrays of positions that are aligned together, because components have different frames; by
-            default all.
     """
     estimated, true = np.asarray(estimated, float), np.asarray(true, float)
     if estimated.shape != true.shape or estimated.ndim != 2 or estimated.shape[1] != 3 or not len(true):
@@ -76,13 +71,8 @@ def absolute_trajectory_error(
             f"the ATE needs two trajectories (N, 3) with N >= 1, got {estimated.shape} and {true.shape}",
             code="shape_mismatch",
         )
-    squares = np.empty(len(true))
-    for rows in segments if segments is not None else [np.arange(len(true))]:
-        moved = estimated[rows]
-        if align != "none":
-            moved = _align(true[rows], moved, with_scale=align == "similarity")
-        squares[rows] = ((moved - true[rows]) ** 2).sum(1)
-    return float(np.sqrt(squares.mean()))
+    moved = estimated if align == "none" else _align(true, estimated, with_scale=align == "similarity")
+    return float(np.sqrt(((moved - true) ** 2).sum(1).mean()))
 
 
 def _align(true: np.ndarray, estimated: np.ndarray, with_scale: bool) -> np.ndarray:

@@ -14,7 +14,6 @@ from gsmap.evaluate.images import psnr, ssim
 from gsmap.formats.pictures import open_picture
 from gsmap.geometry.camera_models import undistort
 from gsmap.types import Cameras, Gaussians
-from gsmap.types.progress import Progress
 
 _SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 
@@ -79,7 +78,6 @@ def compare_renders(
     images: Mapping[int, np.ndarray | Path],
     *,
     lpips: Callable[[np.ndarray, np.ndarray], float] | None = None,
-    progress: Progress | None = None,
 ) -> ImageScores:
     """Render Gaussians from cameras and compare the renders with images.
 
@@ -97,7 +95,7 @@ def compare_renders(
 
     index = ChunkIndex.build(gaussians)
     figures = []
-    for done, (at, image) in enumerate(sorted(images.items())):
+    for at, image in sorted(images.items()):
         if isinstance(image, str | os.PathLike):
             image = read_image(image)
         camera, known = cameras[at], None
@@ -109,8 +107,6 @@ def compare_renders(
             image = np.where(known[..., None], image, rendered)
         scores = psnr(rendered, image, known), ssim(rendered, image, known)
         figures.append((*scores, lpips(rendered, image) if lpips else 0.0))
-        if progress is not None:
-            progress((done + 1) / len(images), f"image {done + 1} of {len(images)}")
     table = np.array(figures).reshape(-1, 3)
     names = tuple(cameras.names[at] for at in sorted(images))
     return ImageScores(names, table[:, 0], table[:, 1], table[:, 2] if lpips else np.zeros(0))

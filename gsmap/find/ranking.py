@@ -13,9 +13,7 @@ _STEPS = 20
 
 
 def rank_by_similarity(
-    query: Sequence[SegmentDescriptor],
-    objects: Sequence[Sequence[SegmentDescriptor]],
-    model: SimilarityModel | None = None,
+    query: Sequence[SegmentDescriptor], objects: Sequence[Sequence[SegmentDescriptor]]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the probability, for each object, that it is of the same kind as the query object.
 
@@ -30,7 +28,7 @@ def rank_by_similarity(
         The (N,) probabilities, see `calibrated`, and the (N,) index of each object's observation that matched best; 0
         and -1 for objects without observations.
     """
-    model = model or SimilarityModel.load()
+    model = SimilarityModel.load()
     owner = np.repeat(np.arange(len(objects)), [len(observations) for observations in objects])
     flat = [one for observations in objects for one in observations]
     odds = np.full(len(flat), -np.inf)

@@ -35,12 +35,11 @@ _KEYS = {
 DATAPARSER = "dataparser_transforms.json"
 
 
-def parse(content: dict[str, Any], path: Path, dataparser: Path | None = None) -> Cameras:
+def parse(content: dict[str, Any], path: Path) -> Cameras:
     """Return the cameras of a parsed file, transformed to the frame in which the splats were trained.
 
     Args:
         path: The file; image sizes and ``dataparser_transforms.json`` are looked up beside it.
-        dataparser: Path of ``dataparser_transforms.json``, if it is elsewhere.
 
     Nerfstudio trains in ``scale * (transform @ x)`` of the *original* coordinates, while the poses of
     ``transforms.json`` already had ``applied_transform`` and ``applied_scale`` done to them: both are taken back first.
@@ -62,7 +61,7 @@ def parse(content: dict[str, Any], path: Path, dataparser: Path | None = None) -
     scales = np.cbrt(np.abs(np.linalg.det(pose[:, :3, :3])))  # without sign: Cameras refuses a mirrored pose
     pose[:, :3, :3] /= scales[:, None, None]
 
-    beside = dataparser or path.parent / DATAPARSER
+    beside = path.parent / DATAPARSER
     if beside.is_file():
         change = load_json(beside)
         S_train_saved = _rows_to_matrix(change["transform"])

@@ -19,7 +19,6 @@ from gsmap.optimize.pose_changes import diff, motion, moved
 from gsmap.optimize.recipe import recipe_key
 from gsmap.optimize.unchanged_poses import keep_unchanged_poses
 from gsmap.types import Edge, PoseGraph, Prior
-from gsmap.types.progress import Progress, silent
 from gsmap.types.world import Survey
 
 __all__ = [
@@ -45,7 +44,6 @@ def optimize(
     priors: Sequence[Prior] = (),
     previous: PoseGraph | None = None,
     params: Params | None = None,
-    progress: Progress = silent,
     survey: Survey | None = None,
 ) -> PoseGraph:
     """Estimate the poses of all scenes from pairwise edges, some of which are wrong. Pure and deterministic.
@@ -64,7 +62,6 @@ def optimize(
         previous: the previous answer. The frame of its largest component is kept, so that maps do not jump. In large
             maps a few new scenes are placed in it (``provenance.method == "incremental"``); see `Params`.
         params: see `Params`.
-        progress: called with the completed fraction and a short text.
         survey: observations of the world, with positions in the world frame. They deform the components that they
             georeference, but never move a component as a whole: its pose in the world is in ``world`` of the answer.
 
@@ -82,7 +79,7 @@ def optimize(
         placed = place_new(scene_ids, edges, priors, previous, params, survey or Survey())
         if placed is not None:
             return placed
-    return solve_batch(scene_ids, edges, priors, previous, params, progress, survey or Survey())
+    return solve_batch(scene_ids, edges, priors, previous, params, survey or Survey())
 
 
 def surroundings(

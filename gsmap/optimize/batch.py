@@ -34,7 +34,6 @@ from gsmap.optimize.robust import GaussNewton, chi_squares, chordal
 from gsmap.optimize.state import State, initial_state, refine
 from gsmap.optimize.structure import component_labels, roots
 from gsmap.types import Edge, PoseGraph, Prior, Provenance
-from gsmap.types.progress import Progress
 from gsmap.types.world import Survey
 
 _GNC_START_GATES = 16.0  # initial width of the robust kernel of graduated non-convexity, in gates
@@ -47,7 +46,6 @@ def solve_batch(
     priors: Sequence[Prior],
     previous: PoseGraph | None,
     params: Params,
-    progress: Progress,
     survey: Survey,
 ) -> PoseGraph:
     """Solve a map as `gsmap.optimize.optimize` does; edges and priors must be sorted by id."""
@@ -60,17 +58,15 @@ def solve_batch(
     repeated = find_repeated(m)
     if repeated.any():
         rows = np.flatnonzero(~repeated)
-        state, cycles = _robust(m[rows], terms, gate, params, progress)
+        state, cycles = _robust(m[rows], terms, gate, params)
         state, cycles = state.spread(rows, len(m)), cycles.spread(rows, len(m))
         _accept_repeated(m, state, repeated, gate, params)
     else:
-        state, cycles = _robust(m, terms, gate, params, progress)
+        state, cycles = _robust(m, terms, gate, params)
     _reconsider(m, state, gate)
     _check_confirmed(m, state, gate)
 
-    solved = solve_components(
-        m, state, _ages(m, scene_ids), previous, params, lambda f, text: progress(0.75 + 0.25 * f, text), survey
-    )
+    solved = solve_components(m, state, _ages(m, scene_ids), previous, params, survey)
     answer = pose_graph(m, solved.poses, solved.component, solved.covariances, state, cycles, params)
     return replace(
         answer,
@@ -81,17 +77,15 @@ def solve_batch(
     )
 
 
-def _robust(
-    m: Measurements, terms: PriorTerms, gate: float, params: Params, progress: Progress
-) -> tuple[State, CycleSupport]:
+def _robust(m: Measurements, terms: PriorTerms, gate: float, params: Params) -> tuple[State, CycleSupport]:
     """Solve robustly for the poses and the accepted edges, doubtful edges included."""
     doubtful = find_doubtful(m, params.max_disagreement)
-    state, cycles = _grown_from(m, ~doubtful, terms, gate, params, progress)
+    state, cycles = _grown_from(m, ~doubtful, terms, gate, params)
     if (m.disagreement > 0).any() and not state.accepted.all():
         stricter = find_doubtful_in_map(m, state, doubtful, gate, params)
         if (stricter & ~doubtful).any():
             doubtful = stricter
-            state, cycles = _grown_from(m, ~doubtful, terms, gate, params, progress)
+            state, cycles = _grown_from(m, ~doubtful, terms, gate, params)
     if doubtful.any():
         # The map is built from undoubted edges; doubtful edges, which may join different places, are compared with it
         # later.
@@ -108,27 +102,23 @@ def _accept_repeated(m: Measurements, state: State, repeated: np.ndarray, gate: 
 
 
 def _grown_from(
-    m: Measurements, undoubted: np.ndarray, terms: PriorTerms, gate: float, params: Params, progress: Progress
+    m: Measurements, undoubted: np.ndarray, terms: PriorTerms, gate: float, params: Params
 ) -> tuple[State, CycleSupport]:
     """Grow components from the edges in ``undoubted``; the remaining edges are neither accepted nor rejected."""
     if undoubted.all():
-        return _grown(m, terms, gate, params, progress)
+        return _grown(m, terms, gate, params)
     rows = np.flatnonzero(undoubted)
-    state, cycles = _grown(m[rows], terms, gate, params, progress)
+    state, cycles = _grown(m[rows], terms, gate, params)
     return state.spread(rows, len(m)), cycles.spread(rows, len(m))
 
 
-def _grown(
-    m: Measurements, terms: PriorTerms, gate: float, params: Params, progress: Progress
-) -> tuple[State, CycleSupport]:
+def _grown(m: Measurements, terms: PriorTerms, gate: float, params: Params) -> tuple[State, CycleSupport]:
     """Grow components from all edges of ``m``, and split them where places look alike; also return the cycle support of
     the edges."""
-    progress(0.05, "testing cycles")
     cycles = count_cycle_support(m, params.gate_probability)
     state = initial_state(m, cycles, terms, params)
     refine(m, state, gate, _GNC_START_GATES)
-    for turn in range(_MAX_ROUNDS):
-        progress(0.1 + 0.6 * turn / _MAX_ROUNDS, "growing components")
+    for _ in range(_MAX_ROUNDS):
         if accept_agreeing_edges(m, state, params):
             cut_weak_bridges(m, state, params)
             refine(m, state, gate)

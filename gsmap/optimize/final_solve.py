@@ -16,7 +16,6 @@ from gsmap.optimize.structure import component_labels
 from gsmap.optimize.survey import tie_component
 from gsmap.optimize.survey_system import Component
 from gsmap.types import PoseGraph, Sim3
-from gsmap.types.progress import Progress
 from gsmap.types.world import Georeference, Survey
 
 
@@ -46,7 +45,6 @@ def solve_components(
     ages: np.ndarray,
     previous: PoseGraph | None,
     params: Params,
-    progress: Progress,
     survey: Survey,
 ) -> FinalPoses:
     """Compute exact poses and covariances of every component from the accepted edges.
@@ -72,7 +70,6 @@ def solve_components(
     world: int | None = None
     max_scenes = params.max_marginal_scenes if params.marginals else 0
     for index, label in enumerate(order):
-        progress(index / len(order), "final solve")
         scenes, mine = members[label], edge_members[label]
         own = state.terms[np.flatnonzero(prior_labels == label)] if label in with_priors else state.terms[:0]
         anchor = choose_anchor(scenes, m.scene_ids, previous)

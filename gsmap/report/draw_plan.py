@@ -87,10 +87,10 @@ def _colour(index: int) -> str:
     return f"c{index % _COLOURS}"
 
 
-def ellipse(covariance: np.ndarray, num: int = 48) -> np.ndarray:
-    """Return the 95 % confidence ellipse (num, 2) of a covariance (2, 2), around zero."""
+def ellipse(covariance: np.ndarray) -> np.ndarray:
+    """Return the 95 % confidence ellipse (N, 2) of a covariance (2, 2), around zero."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    angles = np.linspace(0, 2 * np.pi, num, endpoint=False)
+    angles = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)])
     found: np.ndarray = (vectors @ (np.sqrt(_QUANTILE_95 * np.maximum(values, 0))[:, None] * circle)).T
     return found

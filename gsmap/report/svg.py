@@ -155,12 +155,12 @@ def bar(x: float, y: float, width: float, height: float, class_: str, tip: str =
     )  # fmt: skip
 
 
-def path(points: np.ndarray, class_: str, *, closed: bool = False, tip: str = "") -> Markup:
+def path(points: np.ndarray, class_: str, *, closed: bool = False) -> Markup:
     """Draw straight lines through (N, 2) points."""
     if len(points) == 0:
         return Markup("")
     data = "M" + "L".join(f"{f(x)} {f(y)}" for x, y in points) + "Z" * closed
-    return tag("path", tag("title", tip) if tip else None, d=data, class_=class_)
+    return tag("path", d=data, class_=class_)
 
 
 def paths(lines: Sequence[np.ndarray], class_: str, *, closed: bool = True, tip: str = "") -> Markup:

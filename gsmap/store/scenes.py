@@ -43,7 +43,6 @@ from gsmap.stream import bounds as bounds_of
 from gsmap.stream import shift_origin, sorted_along_morton_curve
 from gsmap.types import Cameras, Gaussians, GaussianSource, Scene, Sim3, Thinning
 from gsmap.types.gaussians import FIELDS
-from gsmap.types.progress import Progress
 from gsmap.types.scene import SceneEdits
 from gsmap.types.source import ChunkSource, origin_of_source
 
@@ -84,8 +83,6 @@ class Scenes:
         antialiased: bool = False,
         notes: tuple[str, ...] = (),
         dated_by: str = "",
-        rename: bool = True,
-        progress: Progress | None = None,
     ) -> tuple[Scene, bool]:
         """Add a scene; durable when it returns.
 
@@ -95,7 +92,7 @@ class Scenes:
                 `gsmap.stream.morton_sort.BUCKET_BYTES` and a few bytes each.
             captured_at: ISO 8601; default time zone UTC.
             dated_by: source of the date; empty if the user specified it.
-            rename: if the name is in use, take ``name-2`` and so on; otherwise raise.
+            name: if it is in use, ``name-2`` and so on is taken.
 
         Returns:
             The scene, and True if its content was written. Content that is already in the map is not written, though a
@@ -103,7 +100,7 @@ class Scenes:
                 one. Removed content returns under the new name, and damaged content is repaired.
 
         Raises:
-            InputError: no Gaussians, an invalid name or date, or the name is in use and ``rename`` is off.
+            InputError: no Gaussians, or an invalid name or date.
         """
         facts.validated_scene_name(name)
         captured_at = None if captured_at is None else facts.validated_date(captured_at)
@@ -141,14 +138,10 @@ class Scenes:
         if stored:  # removed but not pruned
             with self._catalog.write() as connection:
                 if has_group(connection, new_id):
-                    return self._insert_scene(connection, new_id, fields, rename, dated_by), True
-        if progress:
-            progress(0.1, f"sorting {name}")
+                    return self._insert_scene(connection, new_id, fields, dated_by), True
         with contextlib.ExitStack() as until_end:
             until_end.enter_context(translate_errors(self._catalog.folder, NOT_KEPT))
             with self._arrays.scratch() as scratch, sorted_along_morton_curve(gaussians, box, scratch) as ordered:
-                if progress:
-                    progress(0.4, f"writing {name}")
                 content = GaussianBlocks(ordered, CHUNK_ROWS)
                 arrays: dict[str, np.ndarray | StreamedArray] = {**content.arrays, **camera_arrays(cameras)}
                 staging = self._arrays.stage(arrays, KIND, new_id)
@@ -161,7 +154,7 @@ class Scenes:
                     return scene, False
                 # otherwise its bytes are damaged
             else:
-                scene = self._insert_scene(connection, new_id, fields, rename, dated_by)
+                scene = self._insert_scene(connection, new_id, fields, dated_by)
             publish(self._catalog, connection, self._arrays, staged, KIND, new_id)
             if row is not None and row.thinned is not None:
                 forget_derived(connection, new_id)  # computed from the compact Gaussians, which have other rows
@@ -609,16 +602,9 @@ class Scenes:
             return self.get(known_id)
         return self.edit(known_id, captured_at=captured_at, author=dated_by)
 
-    def _insert_scene(
-        self, connection: Connection, new_id: str, fields: dict[str, Any], rename: bool, dated_by: str
-    ) -> Scene:
+    def _insert_scene(self, connection: Connection, new_id: str, fields: dict[str, Any], dated_by: str) -> Scene:
         """Insert the row of a new scene, or update that of a returning scene, under an unused name."""
-        wanted, name = fields["name"], unused_name(connection, fields["name"])
-        if name != wanted and not rename:
-            raise InputError(
-                f"another scene has the name {wanted!r}: choose another name, or remove that scene first",
-                code="name_taken",
-            )
+        name = unused_name(connection, fields["name"])
         when = next_timestamp(connection, scenes.c.removed_at, scenes.c.id == new_id)
         fields = fields | {"name": name, "ingested_at": when, "removed_at": None}
         before = by_id(connection, new_id)

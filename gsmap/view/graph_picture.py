@@ -8,26 +8,18 @@ import numpy as np
 from PIL import Image, ImageDraw
 from scipy.spatial import cKDTree
 
-from gsmap.errors import InputError, NotFoundError
+from gsmap.errors import InputError
 from gsmap.geometry.projection import in_image, on_surface, project
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph
 from gsmap.types.views import View
 
 _MAX_LANDMARKS = 150
-_EDGES = 4  # number of lines drawn per object
+_EDGES, _EDGE_M = 4, 1.5  # number of lines drawn per object, and their maximum length in metres
 
 
-def draw_graph(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    graph: SceneGraph,
-    *,
-    camera: int | str | None = None,
-    width_px: int = 960,
-    local_distance_m: float = 1.5,
-) -> np.ndarray:
-    """Draw a scene graph over a render of the scene: (H, W, 3) uint8.
+def draw_graph(gaussians: Gaussians, cameras: Cameras, graph: SceneGraph, *, width_px: int = 960) -> np.ndarray:
+    """Draw a scene graph over a render from the camera that sees most nodes: (H, W, 3) uint8.
 
     Objects are discs with their number (the row of the layer), joined to the nearest of the visible neighbours that
     their context is counted over; a disc is a small ring where the object is hidden. The strongest landmarks are small
@@ -37,25 +29,14 @@ def draw_graph(
     Args:
         gaussians, cameras: The scene.
         graph: Its scene graph.
-        camera: Index or name of the camera; default: the camera that sees most nodes.
         width_px: Width of the picture.
-        local_distance_m: Maximum length of the lines between objects, in metres.
 
     Raises:
         InputError: The scene has no cameras.
-        NotFoundError: No camera has the name.
     """
     if len(cameras) == 0:
         raise InputError("a picture of the graph needs a scene with at least one camera", code="nothing_to_draw")
-    if camera is None:
-        view = _best_view(gaussians, cameras, graph, width_px)
-    else:
-        if isinstance(camera, str) and camera not in cameras.names:
-            raise NotFoundError(
-                f"no camera is named {camera}; the first is {cameras.names[0]}", code="camera_not_found"
-            )
-        row = cameras.names.index(camera) if isinstance(camera, str) else int(camera)
-        view = _render(gaussians, _wide(cameras[row], width_px), 4 * width_px)
+    view = _best_view(gaussians, cameras, graph, width_px)
     picture = Image.fromarray(view.rgb).convert("RGBA")
     over = Image.new("RGBA", picture.size)
     draw = ImageDraw.Draw(over)
@@ -64,7 +45,7 @@ def draw_graph(
         _draw_landmarks(draw, landmarks, view)
     objects = graph.layers.get("objects")
     if objects is not None and len(objects):
-        _draw_objects(draw, objects, view, local_distance_m / objects.unit_m)
+        _draw_objects(draw, objects, view, _EDGE_M / objects.unit_m)
     return np.asarray(Image.alpha_composite(picture, over).convert("RGB"))
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from raising import raises
 
-from gsmap.errors import InputError, NotFoundError
+from gsmap.errors import InputError
 from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph
 from gsmap.view.graph_picture import draw_graph
 
@@ -31,9 +31,10 @@ def layer(positions: list[list[float]]) -> NodeLayer:
 
 def test_a_picture_of_the_graph_shows_it():
     gaussians, cameras = wall()
+    cameras = cameras[1]
     graph = SceneGraph("w", {"objects": layer([[0.6, 0, 3], [-0.6, 0, 3]]), "landmarks": layer([[0, 0.9, 3]])})
-    empty = draw_graph(gaussians, cameras, SceneGraph("w"), camera="b", width_px=320)
-    drawn = (draw_graph(gaussians, cameras, graph, camera="b", width_px=320) != empty).any(2)
+    empty = draw_graph(gaussians, cameras, SceneGraph("w"), width_px=320)
+    drawn = (draw_graph(gaussians, cameras, graph, width_px=320) != empty).any(2)
     assert drawn.shape == (240, 320)
     assert drawn.dtype == bool
     for column, row in ((200, 120), (120, 120), (160, 180)):
@@ -45,18 +46,17 @@ def test_a_picture_of_the_graph_shows_it():
 
 def test_what_is_hidden_is_a_ring_and_landmarks_behind_the_wall_are_not_drawn():
     gaussians, cameras = wall()
+    cameras = cameras[1]
     graph = SceneGraph("w", {"objects": layer([[0, 0, 6]]), "landmarks": layer([[1.0, 1.0, 6]])})
-    empty = draw_graph(gaussians, cameras, SceneGraph("w"), camera=1, width_px=320)
-    drawn = (draw_graph(gaussians, cameras, graph, camera=1, width_px=320) != empty).any(2)
+    empty = draw_graph(gaussians, cameras, SceneGraph("w"), width_px=320)
+    drawn = (draw_graph(gaussians, cameras, graph, width_px=320) != empty).any(2)
     assert drawn[114:127, 154:167].any()
     assert not drawn[118:123, 158:163].any()
     drawn[110:131, 150:171] = False
     assert not drawn.any()
 
 
-def test_no_camera_and_unknown_cameras_are_refused():
+def test_a_scene_without_cameras_is_refused():
     gaussians, cameras = wall()
-    with raises(NotFoundError, code="camera_not_found"):
-        draw_graph(gaussians, cameras, SceneGraph("w"), camera="attic")
     with raises(InputError, code="nothing_to_draw"):
         draw_graph(gaussians, cameras[[]], SceneGraph("w"))
