@@ -253,26 +253,32 @@ class ArrayLayout:
         if not self.frames:
             out[:] = 0
             return out
-        at, held, chunk = 0, -1, out
+        at, held, scratch = 0, -1, np.empty(0, self.dtype)
         for start, stop in ranges:
             for i in range(start // self.chunk_rows, -(-stop // self.chunk_rows)):
-                if i != held:
-                    held, chunk = i, self._unpacked(bytes_of(self.frames[i]))
                 first = i * self.chunk_rows
-                part = chunk[max(start - first, 0) : stop - first]
-                out[at : at + len(part)] = part
-                at += len(part)
+                skipped, count = max(start - first, 0), min(stop - first, self.chunk_rows) - max(start - first, 0)
+                part = out[at : at + count]
+                at += count
+                if count == self.chunk_rows and part.flags.c_contiguous:
+                    self._unpack(bytes_of(self.frames[i]), part)
+                    continue
+                if i != held:
+                    scratch = scratch if len(scratch) else np.empty((self.chunk_rows, *self.shape[1:]), self.dtype)
+                    held = i
+                    self._unpack(bytes_of(self.frames[i]), scratch)
+                part[:] = scratch[skipped : skipped + count]
         return out
 
-    def _unpacked(self, frame: bytes) -> np.ndarray:
+    def _unpack(self, frame: bytes, out: np.ndarray) -> None:
+        """Decompress a chunk into a contiguous array of its size."""
         from numcodecs import zstd
 
         self.check_head(frame)
         try:
-            content = zstd.decompress(frame)
+            zstd.decompress(frame, out)
         except RuntimeError as error:
             raise ValueError(f"one of its chunks differs from what gsmap wrote ({error})") from error
-        return np.frombuffer(content, self.dtype).reshape(self.chunk_rows, *self.shape[1:])
 
 
 def repair_advice(kind: str) -> str:

@@ -396,11 +396,16 @@ class Scenes:
                 code="arrays_corrupt",
             )
 
-        def read(ranges: Sequence[tuple[int, int]]) -> Gaussians:
+        def read(fields: Sequence[str], start: int, stop: int, out: Gaussians) -> None:
             with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
-                return self._read(row, files, ranges)
+                if row.thinned is None:
+                    self._fields(row, files, fields, [(start, stop)], out)
+                    return
+                found = self._read(row, files, [(start, stop)])
+            for name in fields:
+                getattr(out, name)[:] = getattr(found, name)
 
-        return ChunkSource(row.num_gaussians, boxes, CHUNK_ROWS, read)
+        return ChunkSource(row.num_gaussians, row.sh_degree, boxes, CHUNK_ROWS, read)
 
     def _read(
         self, row: Row[Any], files: tuple[StoredFile, ...], ranges: Sequence[tuple[int, int]] | None
@@ -422,8 +427,9 @@ class Scenes:
         files: tuple[StoredFile, ...],
         names: Sequence[str],
         ranges: Sequence[tuple[int, int]] | None = None,
+        out: Gaussians | None = None,
     ) -> dict[str, np.ndarray]:
-        """Read fields of the Gaussians (or ``sh0``) of a scene that is not thinned."""
+        """Read fields of the Gaussians (or ``sh0``) of a scene that is not thinned; into ``out`` if it is given."""
         only, optional = stored_names(names)
         whole = [(0, row.num_gaussians)] if ranges is None else ranges
         count = sum(max(0, min(stop, row.num_gaussians) - start) for start, stop in whole)
@@ -431,8 +437,12 @@ class Scenes:
 
         def target() -> dict[str, np.ndarray]:
             nonlocal together
-            together = np.empty((count, (row.sh_degree + 1) ** 2, 3), np.float32)
-            return {"sh0": together[:, :1], "sh_rest": together[:, 1:]}
+            into = {} if out is None else {name: getattr(out, name) for name in names}
+            if "sh" in names:
+                shape = (count, (row.sh_degree + 1) ** 2, 3)
+                together = np.empty(shape, np.float32) if out is None else out.sh
+                into |= {"sh0": together[:, :1], "sh_rest": together[:, 1:]}
+            return into
 
         read = self._arrays.read(
             KIND,
@@ -442,7 +452,7 @@ class Scenes:
             optional=optional,
             rows=ranges,
             shapes=shapes_of(row),
-            out=target if "sh" in names else None,
+            out=target,
         )
         try:
             return fields_of(read, names, together)

@@ -72,12 +72,15 @@ class ChunkSource:
 
     Args:
         num_gaussians: N.
+        sh_degree: degree of the spherical harmonics.
         boxes: (C, 2, 3) boxes around the chunks in stored order, extended by three standard deviations along each axis.
         rows: number of Gaussians of a chunk; the last chunk may have fewer.
-        read: reads ranges ``[start, stop)`` of rows.
+        read: ``read(fields, start, stop, out)`` reads fields of rows ``[start, stop)`` into Gaussians of that
+            number.
     """
 
     num_gaussians: int
+    sh_degree: int
     boxes: np.ndarray
     rows: int
-    read: Callable[[Sequence[tuple[int, int]]], Gaussians]
+    read: Callable[[Sequence[str], int, int, Gaussians], None]
