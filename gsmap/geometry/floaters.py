@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmap._native import PointTree
+from gsmap._native import unlike
 from gsmap.geometry.neighbours import chunks_of_neighbours, nearest_of, neighbours_of
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.geometry.sh import rgb_of_sh0
@@ -45,9 +45,9 @@ def find_floaters(points: np.ndarray, colours: np.ndarray, max_difference: float
     """
     if len(points) < 9:
         return np.zeros(len(points), bool), np.zeros(len(points))
-    tree = PointTree(np.ascontiguousarray(points, np.float64))
-    spacing, unlike = tree.unlike(np.ascontiguousarray(colours, np.float64), 8)
-    return (spacing > _FAR * np.median(spacing)) | (unlike >= max_difference), spacing
+    both = (np.ascontiguousarray(array, np.float32) for array in (points, colours))
+    spacing, foreign = unlike(*both, 8)
+    return (spacing > _FAR * np.median(spacing)) | (foreign >= max_difference), spacing
 
 
 def find_detached(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray] | None:

@@ -8,6 +8,7 @@
 
 #include "merging.h"
 #include "rasteriser_view.h"
+#include "threads.h"
 
 namespace gsmap {
 
@@ -19,9 +20,18 @@ struct Point {
 class Leaves {
   public:
     // Puts the points, all finite, in the order of the leaves.
-    explicit Leaves(std::vector<Point> &points) : count_((int64_t(points.size()) + kLeaf - 1) / kLeaf) {
+    explicit Leaves(std::vector<Point> &points) : count_(leaves_of(int32_t(points.size()))) {
         leaves_.reserve(std::size_t(count_));
-        if (count_) build(points, 0, int32_t(points.size()));
+        if (!count_) return;
+        nodes_.resize(std::size_t(2 * count_ - 1));
+        std::vector<Part> parts{{0, 0, int32_t(points.size())}};
+        while (parts.size() < kParts && points.size() / parts.size() > kLargest) {
+            parallel_for(int64_t(parts.size()), [&](int64_t i) { split(points, parts[i]); });
+            std::vector<Part> halves;
+            for (const Part &part : parts) halves.push_back(half(part, 0)), halves.push_back(half(part, 1));
+            parts.swap(halves);
+        }
+        parallel_for(int64_t(parts.size()), [&](int64_t i) { build(points, parts[i]); });
     }
     int64_t count() const { return count_; }
     // Lets rows be the places of the points in the order of the leaves.
@@ -72,9 +82,22 @@ class Leaves {
         int32_t right, leaf;  // the left child is the next; of a leaf right is 0
     };
 
-    void build(std::vector<Point> &points, int32_t from, int32_t to) {
-        const std::size_t at = nodes_.size();
-        Node node{{}, {}, 0, from / kLeaf};
+    struct Part {
+        int32_t node, from, to;
+    };
+    static constexpr std::size_t kParts = 128, kLargest = 8192;  // parts of larger trees are built side by side
+
+    static int32_t leaves_of(int32_t points) { return (points + kLeaf - 1) / kLeaf; }
+    // Where a part is split: all leaves but the last are full.
+    static int32_t middle_of(const Part &part) { return part.from + (leaves_of(part.to - part.from) + 1) / 2 * kLeaf; }
+    Part half(const Part &part, int which) const {
+        const int32_t middle = middle_of(part);
+        return which ? Part{nodes_[part.node].right, middle, part.to} : Part{part.node + 1, part.from, middle};
+    }
+    // Makes a node, and returns whether it has halves.
+    bool split(std::vector<Point> &points, const Part &part) {
+        const auto [at, from, to] = part;
+        Node &node = nodes_[at] = {{}, {}, 0, from / kLeaf};
         std::fill_n(node.low, 3, __builtin_inff());
         std::fill_n(node.high, 3, -__builtin_inff());
         for (int32_t i = from; i < to; ++i)
@@ -82,7 +105,6 @@ class Leaves {
                 node.low[k] = std::min(node.low[k], points[i].at[k]);
                 node.high[k] = std::max(node.high[k], points[i].at[k]);
             }
-        nodes_.push_back(node);
         if (to - from <= kLeaf) {
             Leaf &leaf = leaves_.get()[from / kLeaf];
             std::copy_n(node.low, 3, leaf.low);
@@ -92,20 +114,21 @@ class Leaves {
                 leaf.row[i] = i < leaf.count ? points[from + i].row : -1;
                 for (int k = 0; k < 3; ++k) leaf.at[k][i] = i < leaf.count ? points[from + i].at[k] : __builtin_inff();
             }
-            return;
+            return false;
         }
         int axis = 0;
         for (int k = 1; k < 3; ++k)
             if (node.high[k] - node.low[k] > node.high[axis] - node.low[axis]) axis = k;
-        // All leaves but the last are full.
-        const int32_t middle = from + ((to - from + 1) / 2 + kLeaf - 1) / kLeaf * kLeaf;
+        const int32_t middle = middle_of(part);
         std::nth_element(points.begin() + from, points.begin() + middle, points.begin() + to,
                          [axis](const Point &a, const Point &b) {
                              return a.at[axis] < b.at[axis] || (a.at[axis] == b.at[axis] && a.row < b.row);
                          });
-        build(points, from, middle);
-        nodes_[at].right = int32_t(nodes_.size());
-        build(points, middle, to);
+        node.right = at + 2 * leaves_of(middle - from);
+        return true;
+    }
+    void build(std::vector<Point> &points, const Part &part) {
+        if (split(points, part)) build(points, half(part, 0)), build(points, half(part, 1));
     }
     // Between the boxes around a leaf and a node, squared.
     static float apart(const Leaf &a, const Node &b) {

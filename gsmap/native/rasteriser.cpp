@@ -36,12 +36,8 @@ const Kernels *kernels = best;
 
 namespace {
 
-// T_camera_world (3, 4), intrinsics fx fy cx cy; ranges (m, 2) of Gaussians that may be visible, or none for all.
-void forward(View &view, const Floats &means, const Floats &quats, const Floats &log_scales, const Floats &logits,
-             const Floats &sh, const Doubles &pose, const Doubles &intrinsics, int width, int height,
-             const std::optional<Ranges> &ranges, const Floats &background, const FloatsOut &colour,
-             const std::optional<FloatsOut> &depth, const FloatsOut &alpha, const std::optional<Ints> &dominant_id,
-             const std::optional<FloatsOut> &max_weight, const std::optional<Floats> &looked_at) {
+// T_camera_world (3, 4), intrinsics fx fy cx cy.
+Camera camera_of(const Doubles &pose, const Doubles &intrinsics, int width, int height) {
     Camera camera{};
     for (int r = 0; r < 3; r++) {
         for (int c = 0; c < 3; c++) camera.R[3 * r + c] = pose.data()[4 * r + c];
@@ -50,6 +46,41 @@ void forward(View &view, const Floats &means, const Floats &quats, const Floats 
     const double *k = intrinsics.data();
     camera.fx = k[0], camera.fy = k[1], camera.cx = k[2], camera.cy = k[3];
     camera.width = width, camera.height = height;
+    return camera;
+}
+
+// Of each candidate, nearest first: rows (begin, end), the least depth, and the blocks (x0, y0, x1, y1) that it may touch.
+void draw(View &view, const Floats &means, const Floats &quats, const Floats &log_scales, const Floats &logits,
+          const Floats &sh, const Doubles &pose, const Doubles &intrinsics, int width, int height, const Ranges &ranges,
+          const Floats &depths, const Ranges &blocks, const Floats &background, const FloatsOut &colour,
+          const std::optional<FloatsOut> &depth, const FloatsOut &alpha, const std::optional<Ints> &dominant_id,
+          const std::optional<FloatsOut> &max_weight) {
+    const Camera camera = camera_of(pose, intrinsics, width, height);
+    const Scene scene = scene_of(means, quats, log_scales, logits, sh);
+    Image image = image_of(background, colour, depth, alpha);
+    image.dominant_id = dominant_id ? dominant_id->data() : nullptr;
+    image.max_weight = max_weight ? max_weight->data() : nullptr;
+    const size_t n = depths.size();
+    if (ranges.size() != 2 * n || blocks.size() != 4 * n) throw std::invalid_argument("candidates need rows, a depth, a box");
+    std::vector<Candidates> candidates(n);
+    const int64_t across = (width + kBlockX - 1) / kBlockX, down = (height + kBlockY - 1) / kBlockY;
+    for (size_t i = 0; i < n; i++) {
+        const int64_t *rows = ranges.data() + 2 * i, *box = blocks.data() + 4 * i;
+        if (rows[0] < 0 || rows[1] > scene.n || box[0] < 0 || box[1] < 0 || box[2] > across || box[3] > down)
+            throw std::invalid_argument("candidates lie in the scene and in the image");
+        candidates[i] = {rows[0], rows[1], depths.data()[i], int(box[0]), int(box[1]), int(box[2]), int(box[3])};
+    }
+    nb::gil_scoped_release release;
+    view.draw(scene, camera, candidates, image);
+}
+
+// See draw; ranges (m, 2) of Gaussians that may be visible, or none for all.
+void forward(View &view, const Floats &means, const Floats &quats, const Floats &log_scales, const Floats &logits,
+             const Floats &sh, const Doubles &pose, const Doubles &intrinsics, int width, int height,
+             const std::optional<Ranges> &ranges, const Floats &background, const FloatsOut &colour,
+             const std::optional<FloatsOut> &depth, const FloatsOut &alpha, const std::optional<Ints> &dominant_id,
+             const std::optional<FloatsOut> &max_weight, const std::optional<Floats> &looked_at) {
+    const Camera camera = camera_of(pose, intrinsics, width, height);
     const Scene scene = scene_of(means, quats, log_scales, logits, sh);
     Image image = image_of(background, colour, depth, alpha);
     image.dominant_id = dominant_id ? dominant_id->data() : nullptr;
@@ -112,6 +143,10 @@ void bind_rasteriser(nb::module_ &m) {
              nb::arg("sh"), nb::arg("pose"), nb::arg("intrinsics"), nb::arg("width"), nb::arg("height"), none("ranges"),
              nb::arg("background"), nb::arg("colour"), none("depth"), nb::arg("alpha"), none("dominant_id"),
              none("max_weight"), none("looked_at"))
+        .def("draw", &draw, nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"), nb::arg("logit_opacities"),
+             nb::arg("sh"), nb::arg("pose"), nb::arg("intrinsics"), nb::arg("width"), nb::arg("height"), nb::arg("ranges"),
+             nb::arg("depths"), nb::arg("blocks"), nb::arg("background"), nb::arg("colour"), none("depth"), nb::arg("alpha"),
+             none("dominant_id"), none("max_weight"))
         .def("backward", &backward, nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"), nb::arg("logit_opacities"),
              nb::arg("sh"), nb::arg("background"), nb::arg("colour"), none("depth"), nb::arg("alpha"), none("g_colour"),
              none("g_depth"), none("g_alpha"), none("gradients"), none("g_pose"))

@@ -1,6 +1,7 @@
 // What the parts of the rasteriser share. Plain data only: it crosses between code compiled for different instruction
 // sets. The pipeline of one view: project -> sort by depth -> bin into tiles -> blend; backwards: blend -> project.
 #pragma once
+#include <cstddef>
 #include <cstdint>
 
 #include "correspondences.h"
@@ -74,6 +75,10 @@ struct TileWork {
     int width, height;
 };
 
+// A tile may be blended in several calls, of which the first starts and the last writes the image.
+enum BlendPart { kBlendOn = 0, kBlendStart = 1, kBlendEnd = 2 };
+constexpr size_t kBlendStateBytes = 36864;  // between two calls, aligned to 64
+
 // One attribute of N Gaussians under Adam: values, first and second moments, all (N, cols).
 struct AdamArrays {
     float *value, *m, *v;
@@ -108,6 +113,8 @@ struct Kernels {
     int (*project)(const Scene &, const Camera &, int64_t begin, int64_t end, Record *out);
     // Returns how many (Gaussian, pixel) pairs were evaluated.
     int64_t (*blend)(const TileWork &, const Image &);
+    // The same in several calls; `open` has a bit for each block of the tile with a pixel that light still comes through.
+    int64_t (*blend_more)(const TileWork &, const Image &, BlendPart, void *state, uint32_t *open);
     // Blends `repeats` rounds into one block, everything in L1: the speed of the inner loop alone. Returns the pairs.
     int64_t (*blend_limit)(int64_t repeats);
     // Writes one slot of kMoments floats for every intersection of the tile.

@@ -84,37 +84,51 @@ INLINE void blend_block(const Round &round, BlendBlock &s, const Lanes &lanes, i
             blend_group<kDepth, kId, kWeight>(round, s, lanes, b, column, row, max_weight);
 }
 
-template <bool kDepth, bool kId, bool kWeight> int64_t blend_tile(const TileWork &work, const Image &image) {
-    Round round;
+// A tile between two calls: its blocks, and which of them still have a pixel that light comes through.
+struct BlendState {
     BlendBlock block[kBlocks];
-    const Lanes lanes;
+    uint32_t open;
+};
+static_assert(sizeof(BlendState) <= kBlendStateBytes, "there is room for it");
+
+INLINE void start_blend(const TileWork &work, const Image &image, const Lanes &lanes, BlendState &state) {
     for (int b = 0; b < kBlocks; b++) {
-        BlendBlock &s = block[b];
+        BlendBlock &s = state.block[b];
         for (int i = 0; i < kPixels; i++) {
             s.t[i] = 1.f, s.r[i] = s.g[i] = s.b[i] = 0.f;
-            if (kDepth) s.depth[i] = 0.f;
-            if (kId) s.best[i] = 0.f, s.id[i] = -1;
+            s.depth[i] = s.best[i] = 0.f, s.id[i] = -1;
         }
         start_alive(work, lanes, b, s.alive);
     }
+    state.open = blocks_in_image(work, image.looked_at);
+}
 
+template <bool kDepth, bool kId, bool kWeight>
+INLINE int64_t go_on_blending(const TileWork &work, const Image &image, const Lanes &lanes, BlendState &state) {
+    Round round;
     int64_t pairs = 0;
-    uint32_t blocks = blocks_in_image(work, image.looked_at);
+    uint32_t blocks = state.open;
     for (int64_t first = 0; first < work.count && blocks; first += kRound) {
         const int n = int(work.count - first < kRound ? work.count - first : kRound);
         round.gather(work, first, n);
         round.cull(blocks);
         for (int b = 0; b < kBlocks; b++) {
             if (!(blocks >> b & 1) || !round.listed[b]) continue;
-            blend_block<kDepth, kId, kWeight>(round, block[b], lanes, b, image.max_weight);
+            BlendBlock &s = state.block[b];
+            blend_block<kDepth, kId, kWeight>(round, s, lanes, b, image.max_weight);
             pairs += round.listed[b] * int64_t(kPixels);
             bool any_alive = false;
-            for (int k = 0; k < kVectors; k++) any_alive |= any(block[b].alive[k]);
+            for (int k = 0; k < kVectors; k++) any_alive |= any(s.alive[k]);
             if (!any_alive) blocks &= ~(1u << b);
         }
     }
+    state.open = blocks;
+    return pairs;
+}
+
+template <bool kDepth, bool kId> INLINE void end_blend(const TileWork &work, const Image &image, const BlendState &state) {
     for_pixels(work, [&](int b, int i, int64_t p) {
-        const BlendBlock &s = block[b];
+        const BlendBlock &s = state.block[b];
         const float t = s.t[i], alpha = 1.f - t;
         image.alpha[p] = alpha;
         if (image.colour) {
@@ -125,6 +139,14 @@ template <bool kDepth, bool kId, bool kWeight> int64_t blend_tile(const TileWork
         if (kDepth) image.depth[p] = alpha > 0.f ? s.depth[i] / alpha : 0.f;
         if (kId) image.dominant_id[p] = s.id[i];
     });
+}
+
+template <bool kDepth, bool kId, bool kWeight>
+int64_t blend_part(const TileWork &work, const Image &image, BlendPart part, BlendState &state) {
+    const Lanes lanes;
+    if (part & kBlendStart) start_blend(work, image, lanes, state);
+    const int64_t pairs = go_on_blending<kDepth, kId, kWeight>(work, image, lanes, state);
+    if (part & kBlendEnd) end_blend<kDepth, kId>(work, image, state);
     return pairs;
 }
 
@@ -152,18 +174,30 @@ int64_t blend_limit(int64_t repeats) {
     return repeats * kRound * kPixels;
 }
 
-int64_t blend(const TileWork &work, const Image &image) {
+int64_t blend_parts(const TileWork &work, const Image &image, BlendPart part, BlendState &state) {
     const int which = (image.depth ? 1 : 0) | (image.dominant_id ? 2 : 0) | (image.max_weight ? 4 : 0);
     switch (which) {
-        case 0: return blend_tile<false, false, false>(work, image);
-        case 1: return blend_tile<true, false, false>(work, image);
-        case 2: return blend_tile<false, true, false>(work, image);
-        case 3: return blend_tile<true, true, false>(work, image);
-        case 4: return blend_tile<false, false, true>(work, image);
-        case 5: return blend_tile<true, false, true>(work, image);
-        case 6: return blend_tile<false, true, true>(work, image);
-        default: return blend_tile<true, true, true>(work, image);
+        case 0: return blend_part<false, false, false>(work, image, part, state);
+        case 1: return blend_part<true, false, false>(work, image, part, state);
+        case 2: return blend_part<false, true, false>(work, image, part, state);
+        case 3: return blend_part<true, true, false>(work, image, part, state);
+        case 4: return blend_part<false, false, true>(work, image, part, state);
+        case 5: return blend_part<true, false, true>(work, image, part, state);
+        case 6: return blend_part<false, true, true>(work, image, part, state);
+        default: return blend_part<true, true, true>(work, image, part, state);
     }
+}
+
+int64_t blend(const TileWork &work, const Image &image) {
+    BlendState state;
+    return blend_parts(work, image, BlendPart(kBlendStart | kBlendEnd), state);
+}
+
+int64_t blend_more(const TileWork &work, const Image &image, BlendPart part, void *state, uint32_t *open) {
+    BlendState &kept = *static_cast<BlendState *>(state);
+    const int64_t pairs = blend_parts(work, image, part, kept);
+    *open = kept.open;
+    return pairs;
 }
 
 }  // namespace GSMAP_ISA

@@ -16,8 +16,8 @@
 #define GSMAP_JOIN_(a, b) a##b
 #define GSMAP_JOIN(a, b) GSMAP_JOIN_(a, b)
 
-static const gsmap::Kernels table = {GSMAP_STRING(GSMAP_ISA), GSMAP_ISA::project, GSMAP_ISA::blend, GSMAP_ISA::blend_limit,
-                                     GSMAP_ISA::blend_backward, GSMAP_ISA::project_backward,
+static const gsmap::Kernels table = {GSMAP_STRING(GSMAP_ISA), GSMAP_ISA::project, GSMAP_ISA::blend, GSMAP_ISA::blend_more,
+                                     GSMAP_ISA::blend_limit, GSMAP_ISA::blend_backward, GSMAP_ISA::project_backward,
                                      GSMAP_ISA::adam, GSMAP_ISA::huber, GSMAP_ISA::ssim, GSMAP_ISA::agree,
                                      GSMAP_ISA::vote, GSMAP_ISA::weigh, GSMAP_ISA::highest,
                                      GSMAP_ISA::peaks, GSMAP_ISA::polar, GSMAP_ISA::near,

@@ -9,6 +9,8 @@
 #include <vector>
 
 #include "arrays.h"
+#include "given.h"
+#include "leaves.h"
 #include "memory.h"
 #include "point_tree.h"
 #include "symmetric.h"
@@ -110,6 +112,43 @@ void planes(const double *points, const int64_t *near, int64_t n, int64_t k, con
             for (int c = 0; c < 3; ++c) normal[3 * i + c] = v[c][order[0]];
             const double least = a[order[0]][order[0]], middle = a[order[1]][order[1]], most = a[order[2]][order[2]];
             flat[i] = (middle - least) / std::max(most, 1e-12);
+        }
+    });
+}
+
+double squared(const float *a, const float *b) {
+    double sum = 0;
+    for (int k = 0; k < 3; ++k) sum += (double(a[k]) - b[k]) * (double(a[k]) - b[k]);
+    return sum;
+}
+
+// Distance to the k-th neighbour of each point, and from its values to those of the second most alike of these k.
+void unlike(const float *at, const float *values, std::size_t n, int k, double *far, double *second) {
+    constexpr float kFarthest = 1e18f;  // squares of differences stay finite
+    std::vector<Point> points(n);
+    for (std::size_t i = 0; i < n; ++i) {
+        for (int a = 0; a < 3; ++a) points[i].at[a] = std::clamp(at[3 * i + a], -kFarthest, kFarthest);
+        points[i].row = int32_t(i);
+    }
+    Leaves leaves(points);  // which brings the points in their order
+    leaves.number();
+    over_blocks(leaves.count(), [&](int64_t, int64_t begin, int64_t end) {
+        std::vector<int32_t> near(std::size_t(kLeaf) * k);
+        for (int64_t leaf = begin; leaf < end; ++leaf) {
+            const std::size_t first = std::size_t(leaf) * kLeaf;
+            leaves.nearest(leaf, k, near.data() - std::ptrdiff_t(first) * k);
+            for (std::size_t i = first; i < std::min(n, first + kLeaf); ++i) {
+                const int32_t row = points[i].row;
+                double farthest = 0, least = __builtin_inf(), next = least;
+                for (int j = 0; j < k; ++j) {
+                    const Point &other = points[near[(i - first) * k + j]];
+                    farthest = std::max(farthest, squared(points[i].at, other.at));
+                    const double off = squared(values + 3 * std::size_t(row), values + 3 * std::size_t(other.row));
+                    next = std::min(next, std::max(off, least));
+                    least = std::min(least, off);
+                }
+                far[row] = std::sqrt(farthest), second[row] = std::sqrt(next);
+            }
         }
     });
 }
@@ -404,36 +443,6 @@ void bind_surface(nb::module_ &m) {
             "Distances and rows (m, k) of the points nearest to each place, or to each of the points, itself among them;\n"
             "inf and n where there are fewer nearer than the radius.")
         .def(
-            "unlike",
-            [](const PointTree &tree, Points values, int k) {
-                if (k < 2 || k >= kMostNeighbours) throw std::invalid_argument("a point is held against 2 to 63 neighbours");
-                const std::size_t n = std::size_t(tree.size());
-                if (values.shape(0) != n) throw std::invalid_argument("a tree's points and values must be as many");
-                Many<double> far(n, __builtin_inf()), second(n, __builtin_inf());
-                {
-                    nb::gil_scoped_release release;
-                    over_blocks(tree.size(), [&](int64_t, int64_t begin, int64_t end) {
-                        Neighbour near[kMostNeighbours];
-                        for (int64_t i = begin; i < end; ++i) {
-                            const int32_t at = tree.row(i);
-                            double least = __builtin_inf();
-                            for (int j = 0, found = tree.nearest(tree.point(at), k + 1, near); j < found; ++j) {
-                                if (j == k) far[at] = std::sqrt(near[j].squared);
-                                if (near[j].row == at) continue;
-                                const double off = PointTree::squared(values.data() + 3 * at, values.data() + 3 * near[j].row);
-                                second[at] = std::min(second[at], std::max(off, least));
-                                least = std::min(least, off);
-                            }
-                            second[at] = std::sqrt(second[at]);
-                        }
-                    });
-                }
-                return std::make_tuple(numpy_of(std::move(far), {n}), numpy_of(std::move(second), {n}));
-            },
-            nb::arg("values"), nb::arg("k"),
-            "How far (n,) the k-th neighbour of each point lies, and how far (n,) its three values are from those of the\n"
-            "second most alike of these k; inf where there are fewer.")
-        .def(
             "normals",
             [](const PointTree &tree, int k) {
                 if (k < 1 || k > kMostNeighbours) throw std::invalid_argument("a plane is that of 1 to 64 points");
@@ -460,6 +469,25 @@ void bind_surface(nb::module_ &m) {
             },
             nb::arg("normals"), nb::arg("values"), nb::arg("k"), nb::arg("ridge_m"),
             "Change (n, 3) of a value per metre within each point's tangent plane, over its k nearest.");
+    m.def(
+        "unlike",
+        [](Rows3 points, Rows3 values, int k) {
+            const std::size_t n = points.shape(0);
+            if (values.shape(0) != n) throw std::invalid_argument("points need three values each");
+            if (k < 2 || k > 20 || n <= std::size_t(k) || n > std::size_t(1) << 30)
+                throw std::invalid_argument("a point is held against 2 to 20 others");
+            for (std::size_t i = 0; i < 3 * n; ++i)
+                if (!std::isfinite(points.data()[i])) throw std::invalid_argument("points must be finite");
+            Many<double> far(n), second(n);
+            {
+                nb::gil_scoped_release release;
+                unlike(points.data(), values.data(), n, k, far.data(), second.data());
+            }
+            return std::make_tuple(numpy_of(std::move(far), {n}), numpy_of(std::move(second), {n}));
+        },
+        nb::arg("points"), nb::arg("values"), nb::arg("k"),
+        "How far (n,) the k-th neighbour of each point lies, and how far (n,) its three values are from those of the\n"
+        "second most alike of these k.");
     m.def(
         "icp_equations",
         [](const PointTree &tree, Points normals, Numbers lightness, std::optional<Points> gradients, Points points,

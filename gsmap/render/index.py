@@ -10,6 +10,8 @@ from gsmap.errors import InputError
 from gsmap.types import Gaussians
 
 MAX_SIGMAS = 3.3290429  # sqrt(2 ln 255): no Gaussian is drawn farther from its centre
+_NEAR, _DILATION = 0.01, 0.3  # near plane, and variance (px^2) that is added to every footprint
+_CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])  # of a box
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +71,10 @@ class ChunkIndex:
             pose: (3, 4) or (4, 4) transform from frame to camera.
             intrinsics_px: ``fx fy cx cy``.
         """
+        return join_ranges(self.starts, self._visible_chunks(pose, intrinsics_px, width, height))
+
+    def _visible_chunks(self, pose: np.ndarray, intrinsics_px: np.ndarray, width: int, height: int) -> np.ndarray:
+        """Return the rows (V,) of the chunks that a camera may see."""
         rotation, translation = pose[:3, :3], pose[:3, 3]
         center = rotation @ ((self.low + self.high).T / 2) + translation[:, None]
         half = (self.high - self.low) / 2
@@ -93,7 +99,47 @@ class ChunkIndex:
                 normal[axis], normal[2] = sign, -sign * border
                 distance = normal @ center + half @ np.abs(normal @ rotation) + grow
                 visible &= distance > 0
-        return join_ranges(self.starts, np.flatnonzero(visible))
+        return np.flatnonzero(visible)
+
+    def candidates(
+        self, pose: np.ndarray, intrinsics_px: np.ndarray, width: int, height: int, block_px: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the chunks that a camera may see, nearest first.
+
+        Each has a range (V, 2) of Gaussians, the least depth (V,) of their centres, and a box (V, 4) of the blocks of
+        pixels that they may touch, ``x0 y0 x1 y1`` (half open).
+
+        Args:
+            pose, intrinsics_px: see `visible_ranges`.
+            block_px: edge length of a block.
+        """
+        chunks = self._visible_chunks(pose, intrinsics_px, width, height)
+        low, high, radius = self.low[chunks], self.high[chunks], self.radius[chunks]
+        rotation, half = pose[:3, :3], (high - low) / 2
+        center = rotation @ ((low + high).T / 2) + pose[:3, 3:]
+        nearest_z = center[2] - half @ np.abs(rotation[2])
+        corners = center + np.einsum("ka,va,ia->kiv", _CORNERS, half, rotation)  # (8, 3, V)
+        box = np.zeros((4, len(chunks)))
+        box[2:] = np.array([[width], [height]])
+        with np.errstate(all="ignore"):
+            for axis, size in ((0, width), (1, height)):
+                focal, principal = intrinsics_px[axis], intrinsics_px[axis + 2]
+                clamp = max(principal / focal, (size - principal) / focal) + 0.15 * size / focal
+                reach = MAX_SIGMAS * np.sqrt((1 + clamp**2) * (focal * radius / nearest_z) ** 2 + _DILATION) + 2
+                at = focal * corners[:, axis] / corners[:, 2] + principal
+                box[axis], box[axis + 2] = at.min(0) - reach, at.max(0) + reach
+        is_bounded = (nearest_z > _NEAR) & np.isfinite(box).all(0)
+        box[:2, ~is_bounded], box[2:, ~is_bounded] = 0, np.array([[width], [height]])
+        blocks = np.empty((len(chunks), 4), np.int64)
+        for axis, size in ((0, width), (1, height)):
+            count = -(-size // block_px)
+            blocks[:, axis] = np.clip(np.floor(box[axis] / block_px), 0, count)
+            blocks[:, axis + 2] = np.clip(np.floor(box[axis + 2] / block_px) + 1, 0, count)
+        rounding = 1e-6 * np.abs(nearest_z) + 1e-9 * (np.abs(center[2]) + half.sum(1) + np.abs(pose[:3, 3]).sum())
+        depths = np.maximum(nearest_z - rounding, 0).astype(np.float32)
+        order = np.argsort(depths, kind="stable")
+        rows = chunks[order]
+        return np.stack([self.starts[rows], self.starts[rows + 1]], axis=1), depths[order], blocks[order]
 
 
 def join_ranges(starts: np.ndarray, chunks: np.ndarray) -> np.ndarray:

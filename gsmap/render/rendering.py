@@ -90,7 +90,11 @@ def render(
         arrays, poses = native.arrays_of(gaussians), cameras.T_camera_frame
         with native.workspace() as view:
             for i in range(len(cameras)):
-                native.forward(view, arrays, poses[i], cameras.intrinsics_px[i], colour, images, i, index)
+                camera = poses[i], cameras.intrinsics_px[i]
+                if index is None:
+                    native.forward(view, arrays, *camera, colour, images, i, None)
+                else:
+                    native.draw(view, arrays, *camera, colour, images, i, index)
         return Rendering(**images)
 
     from gsmap.render import autograd, gsplat

@@ -29,8 +29,10 @@ def test_a_handful_of_points_does_not_stray():
 
 def test_floaters_are_those_of_the_plain_computation():
     rng = np.random.default_rng(1)
-    points, colours = rng.normal(size=(800, 3)) ** 3, rng.uniform(size=(800, 3))
+    points = (rng.normal(size=(800, 3)) ** 3).astype(np.float32)
+    colours = rng.uniform(size=(800, 3)).astype(np.float32)
     distances, neighbours = cKDTree(points).query(points, k=9)
+    points, colours = points.astype(float), colours.astype(float)
     unlike = np.sort(np.linalg.norm(colours[neighbours[:, 1:]] - colours[:, None], axis=2), axis=1)
     foreign = unlike[:, 1] >= 0.4
     alone = distances[:, 8] > 4 * np.median(distances[:, 8])

@@ -50,6 +50,23 @@ def test_index_changes_no_bit(largest):
         assert skipped / 12 > 0.4
 
 
+def test_index_changes_no_bit_where_much_is_hidden_and_depths_are_equal():
+    # More than one round of the kernel, with many chunks that lie behind opaque Gaussians.
+    gaussians = site(200_000, 3, -1.5)
+    rng = np.random.default_rng(4)
+    depths = np.repeat(rng.uniform(-20, 20, 1000), 200) + rng.uniform(-1, 1, 200_000)
+    gaussians.means[:, 2] = np.round(4 * depths) / 4
+    gaussians.logit_opacities[:] += 4
+    index = ChunkIndex.build(gaussians, chunk=200)
+    T = np.eye(4)
+    T[2, 3] = -15
+    cameras = Cameras(T[None], [[60, 60, 51, 33]], [[100, 70]])
+    all_, some = (render(gaussians, cameras, index=i, max_weight=True) for i in (None, index))
+    for name in ("colour", "depth", "alpha", "dominant_id", "max_weight"):
+        assert np.array_equal(getattr(all_, name), getattr(some, name)), name
+    assert (all_.alpha > 0.999).mean() > 0.5
+
+
 def test_gradients_go_through_the_index():
     gaussians = site(20_000, 2, -2.0)
     index = ChunkIndex.build(gaussians, chunk=64)
