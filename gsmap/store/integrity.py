@@ -24,11 +24,9 @@ from gsmap.store.change_rows import KIND as CHANGES
 from gsmap.store.change_rows import newest_of_all
 from gsmap.store.error_translation import PRUNE_MAY, translate_errors
 from gsmap.store.graphs import KIND as GRAPHS
-from gsmap.store.indexes import KIND as INDEXES
-from gsmap.store.layout import CHUNK_ROWS
+from gsmap.store.layout import CHUNK_ROWS, repair_of
 from gsmap.store.models import FOLDER, model_path, open_model
 from gsmap.store.objects import forget_sets
-from gsmap.store.photos import KIND as PHOTOS
 from gsmap.store.photos import claimed_groups
 from gsmap.store.revisions import forget_dropped, scenes_in_kept_revisions
 from gsmap.store.scenes import KIND as SCENES
@@ -322,24 +320,13 @@ def _drop_rows(catalog: Catalog, garbage: _Garbage) -> None:
         connection.execute(delete(groups).where(groups.c.id.in_(ids)))
 
 
-_PURPOSE = {
-    SCENES: "",  # the message states it
-    INDEXES: "the retrieval index: gsmap builds it again when the next scene is added",
-    "views": "features of a scene's views: gsmap computes them again when the next photo is localized",
-    "prepared": "surface cells and renders of a scene: gsmap describe MAP SCENE forgets damaged ones, and the next "
-    "registration stores them again",
-    PHOTOS: "the preview of a kept photo: remove the photo and add it again",
-}
-
-
 def _advice(connection: Connection, kind: str, group: str, location: str | None) -> str:
-    """Return the purpose of a damaged group and how to recompute it; empty if the message states this already."""
+    """Return how to repair a damaged group; empty if the message states this already."""
     if kind == CHANGES:
         return _comparison_advice(connection, group, location)
     if kind == GRAPHS:
         return _graph_advice(connection, group, location)
-    purpose = _PURPOSE.get(kind, "computed from scenes: gsmap computes it again when it is needed")
-    return f" ({purpose})" if purpose else ""
+    return "" if kind == SCENES else f" ({repair_of(kind)})"
 
 
 def _graph_advice(connection: Connection, group: str, location: str | None) -> str:

@@ -281,18 +281,25 @@ class ArrayLayout:
             raise ValueError(f"one of its chunks differs from what gsmap wrote ({error})") from error
 
 
+_REPAIRS = {
+    "scenes": "ingest the scene again",
+    "graphs": "compute the graph again (gsmap describe MAP SCENE)",
+    "changes": "compare its two scenes again (gsmap changes MAP A:B)",
+    "views": "localize a photo: gsmap computes lost features again",
+    "prepared": "describe the scene again (gsmap describe MAP SCENE)",
+    "photos": "remove the photo and add it again (gsmap localize MAP PHOTO --add)",
+    "indexes": "add a capture: gsmap builds the index again",
+}
+
+
+def repair_of(kind: str) -> str:
+    """Return how a damaged group of this kind is repaired."""
+    return _REPAIRS.get(kind, "gsmap computes it again when it is needed")
+
+
 def repair_advice(kind: str) -> str:
     """Return advice for a damaged group of this kind."""
-    again = {
-        "scenes": "ingest the scene again",
-        "graphs": "compute the graph again (gsmap describe MAP SCENE)",
-        "changes": "compare its two scenes again (gsmap changes MAP A:B)",
-        "views": "localize a photo: gsmap computes lost features again",
-        "prepared": "describe the scene again (gsmap describe MAP SCENE)",
-        "photos": "remove the photo and add it again (gsmap localize MAP PHOTO --add)",
-        "indexes": "add a capture: gsmap builds the index again",
-    }
-    return f"run gsmap check, and {again.get(kind, 'gsmap computes it again when it is needed')}"
+    return f"run gsmap check, and {repair_of(kind)}"
 
 
 def _require_codecs(codecs: Any) -> None:

@@ -38,13 +38,7 @@ def merge(into: Store, source: Store) -> MergeReport:
     """
     with open_transfer(into, source) as transfer:
         transfer.scenes()
-        transfer.results()
-        transfer.pairs()
-        transfer_comparisons(transfer)
-        transfer_objects(transfer)
-        transfer.priors()
-        transfer.observations()
-        transfer.photos()
+        _copy_results(transfer)
         transfer.models()
         number = _revisions(transfer)
         transfer.notes += _compare_settings(into, source)
@@ -61,13 +55,7 @@ def split(source: Store, out: Store, chosen: Collection[str]) -> MergeReport:
     """
     with open_transfer(out, source, only=chosen) as transfer:
         transfer.scenes()
-        transfer.results()
-        transfer.pairs()
-        transfer_comparisons(transfer)
-        transfer_objects(transfer)
-        transfer.priors()
-        transfer.observations()
-        transfer.photos()
+        _copy_results(transfer)
         transfer.models()
         number = None
         newest = newest_poses(transfer.theirs)
@@ -101,14 +89,19 @@ def import_scene(into: Store, source: Store, scene: str) -> MergeReport:
             _check_shared(transfer, scene)
         if into.scenes.removed_at(scene) is not None:  # an explicit request overrules the tombstone
             into.scenes.restore(scene)
-        transfer.results()
-        transfer.pairs()
-        transfer_comparisons(transfer)
-        transfer_objects(transfer)
-        transfer.priors()
-        transfer.observations()
-        transfer.photos()
+        _copy_results(transfer)
         return replace(_report(transfer, None), notes=())
+
+
+def _copy_results(transfer: Transfer) -> None:
+    """Copy what the other map has computed from, and recorded about, the copied scenes."""
+    transfer.results()
+    transfer.pairs()
+    transfer_comparisons(transfer)
+    transfer_objects(transfer)
+    transfer.priors()
+    transfer.observations()
+    transfer.photos()
 
 
 def _check_shared(transfer: Transfer, scene: str) -> None:

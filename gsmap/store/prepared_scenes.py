@@ -13,34 +13,18 @@ from gsmap.methods import RecipeKey
 from gsmap.store.array_groups import PackedResult
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
-from gsmap.store.layout import Shape
-from gsmap.store.results import DerivedArrays
+from gsmap.store.results import ArrayTypes, DerivedArrays
 from gsmap.types import Cameras
 from gsmap.types.prepared_scene import PreparedScene
 
 KIND = "prepared"
-
-_TYPES: dict[str, np.dtype[Any]] = {
-    "centre": np.dtype(np.float64),
-    "surface": np.dtype(np.uint8),
-    "points": np.dtype(np.float32),
-    "colours": np.dtype(np.float16),
-    "normals": np.dtype(np.float32),
-    "sides": np.dtype(np.int8),
-    "sample": np.dtype(np.float32),
-    "poses": np.dtype(np.float64),
-    "intrinsics": np.dtype(np.float64),
-    "sizes": np.dtype(np.int64),
-    "image_colours": np.dtype(np.uint8),
-    "image_depths": np.dtype(np.float16),
-}
 
 
 class PreparedScenes(DerivedArrays[PreparedScene]):
     """The prepared scenes of a map."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
-        super().__init__(catalog, arrays, KIND, _TYPES, "the surface cells and views of scene")
+        super().__init__(catalog, arrays, KIND, "the surface cells and views of scene")
 
     def _pack(self, found: PreparedScene) -> PackedResult:
         arrays: dict[str, np.ndarray] = {
@@ -57,14 +41,15 @@ class PreparedScenes(DerivedArrays[PreparedScene]):
             "image_colours": found.image_colours,
             "image_depths": found.image_depths,
         }
-        about = {
+        about: dict[str, Any] = {
             "unit_m": float(found.unit_m),
             "num_gaussians": len(found.is_surface),
             "num_items": len(found.points),
             "num_views": len(found.cameras),
             "num_own": found.num_own,
         }
-        typed = {name: arrays[name].astype(_TYPES[name], copy=False) for name in arrays}
+        types = _layout(about)
+        typed = {name: arrays[name].astype(types[name][0], copy=False) for name in arrays}
         return PackedResult(found.scene, len(found.points), about, typed)
 
     def load(self, scene: str, key: RecipeKey | str) -> PreparedScene | None:
@@ -74,24 +59,24 @@ class PreparedScenes(DerivedArrays[PreparedScene]):
             CorruptError: bytes on disk are missing, differ, or are no prepared scene.
             NotFoundError: another process replaced them meanwhile.
         """
-        return self.get(scene, key, _shapes, _prepared)
+        return self.get(scene, key, _layout, _prepared)
 
 
-def _shapes(about: Mapping[str, int]) -> dict[str, Shape]:
+def _layout(about: Mapping[str, int]) -> ArrayTypes:
     M, V = about["num_items"], about["num_views"]
     return {
-        "centre": (1, 3),
-        "surface": (-(-about["num_gaussians"] // 8),),
-        "points": (M, 3),
-        "colours": (M, 3),
-        "normals": (M, 3),
-        "sides": (M,),
-        "sample": (None, 3),
-        "poses": (V, 16),
-        "intrinsics": (V, 4),
-        "sizes": (V, 2),
-        "image_colours": (None, 3),
-        "image_depths": (None,),
+        "centre": (np.float64, (1, 3)),
+        "surface": (np.uint8, (-(-about["num_gaussians"] // 8),)),
+        "points": (np.float32, (M, 3)),
+        "colours": (np.float16, (M, 3)),
+        "normals": (np.float32, (M, 3)),
+        "sides": (np.int8, (M,)),
+        "sample": (np.float32, (None, 3)),
+        "poses": (np.float64, (V, 16)),
+        "intrinsics": (np.float64, (V, 4)),
+        "sizes": (np.int64, (V, 2)),
+        "image_colours": (np.uint8, (None, 3)),
+        "image_depths": (np.float16, (None,)),
     }
 
 

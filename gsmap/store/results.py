@@ -24,6 +24,8 @@ from gsmap.store.layout import Shape
 from gsmap.store.result_rows import ResultRows
 
 Value = TypeVar("Value")
+ArrayTypes = Mapping[str, tuple[type[np.generic], Shape]]
+"""Type and shape of each array of a result; None for an unknown length."""
 
 
 class DerivedArrays(ArrayResults[Value]):
@@ -31,15 +33,12 @@ class DerivedArrays(ArrayResults[Value]):
 
     Args:
         kind: name of the kind.
-        types: type of each array.
         noun: description for messages.
     """
 
-    def __init__(
-        self, catalog: Catalog, arrays: Arrays, kind: str, types: Mapping[str, np.dtype[Any]], noun: str
-    ) -> None:
+    def __init__(self, catalog: Catalog, arrays: Arrays, kind: str, noun: str) -> None:
         super().__init__(catalog, arrays, ResultRows(kind, is_counts), noun)
-        self._kind, self._types = kind, types
+        self._kind = kind
 
     def _insert(self, connection: Connection, row: Mapping[str, Any]) -> None:
         rows = self._rows
@@ -64,13 +63,13 @@ class DerivedArrays(ArrayResults[Value]):
         self,
         scene: str,
         key: RecipeKey | str,
-        shapes: Callable[[Mapping[str, int]], Mapping[str, Shape]],
+        layout: Callable[[Mapping[str, int]], ArrayTypes],
         parse: Callable[[Row[Any], dict[str, np.ndarray]], Value],
     ) -> Value | None:
         """Read the arrays of a scene with this key; None without such arrays.
 
         Args:
-            shapes: returns the shapes of the arrays from the numbers that describe them.
+            layout: returns the types and shapes of the arrays from the numbers that describe them.
             parse: returns what the row and the arrays describe, or raises InputError or one of `MALFORMED`.
 
         Raises:
@@ -85,11 +84,12 @@ class DerivedArrays(ArrayResults[Value]):
                 return None
             files = manifest(connection, row.group_id)
         with self._invalid_as_corrupt(scene):
-            known = shapes({name: int(value) for name, value in row.about.items()})
+            known = layout({name: int(value) for name, value in row.about.items()})
+            shapes = {name: shape for name, (_, shape) in known.items()}
         with unless_pruned(self._catalog, row.group_id, f"{self._noun} {scene[:12]} were computed again"):
-            arrays = self._arrays.read(self._kind, row.group_id, files, only=list(known), shapes=known)
+            arrays = self._arrays.read(self._kind, row.group_id, files, only=list(known), shapes=shapes)
         with self._invalid_as_corrupt(scene):
-            for name, dtype in self._types.items():
+            for name, (dtype, _) in known.items():
                 if arrays[name].dtype != dtype:
                     raise InputError(f"{name} are {arrays[name].dtype}", code="invalid_record")
             return parse(row, arrays)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from functools import partial
 from typing import Any, TypeVar
 
-from sqlalchemy import Connection, Row, delete, insert, select, update
+from sqlalchemy import Connection, Row, Table, delete, insert, select, update
 
 from gsmap.durable import open_file, write_whole
 from gsmap.errors import ConfigError, CorruptError, StoreError
@@ -383,18 +383,12 @@ class Transfer:
                 self.ours.execute(insert(priors), _content(row))
                 self.counts["priors"] += 1
             elif row.removed_at is not None and known.removed_at is None:
-                taken_back = priors.c.number == known.number
-                self.ours.execute(update(priors).where(taken_back).values(removed_at=row.removed_at))
+                self._take_back(priors, known.number, row.removed_at)
         if not self.counts["priors"]:
             return
         if has_current:
             self.notes.append("both maps have pose priors: they agree only if both use the same frame")
-        for scene in self.wanted:
-            current = (priors.c.scene == scene) & priors.c.removed_at.is_(None)
-            rows = self.ours.execute(select(priors).where(current).order_by(priors.c.created_at)).all()
-            for row in rows[:-1]:
-                earlier = priors.c.number == row.number
-                self.ours.execute(update(priors).where(earlier).values(removed_at=rows[-1].created_at))
+        self._keep_latest(priors, lambda row: row.scene)
 
     def observations(self) -> None:
         """Copy the world observations of the scenes, and the control points in their photos.
@@ -424,16 +418,19 @@ class Transfer:
                 self.ours.execute(insert(observations), _content(row))
                 self.counts["observations"] += 1
             elif row.removed_at is not None and known.removed_at is None:
-                taken_back = observations.c.number == known.number
-                self.ours.execute(update(observations).where(taken_back).values(removed_at=row.removed_at))
-        current: dict[tuple[Any, ...], list[Row[Any]]] = {}
-        query = select(observations).where(observations.c.removed_at.is_(None)).order_by(observations.c.created_at)
-        for row in self.ours.execute(query):
-            current.setdefault((row.kind, row.name, row.scene), []).append(row)
-        for rows in current.values():
-            for row in rows[:-1]:
-                earlier = observations.c.number == row.number
-                self.ours.execute(update(observations).where(earlier).values(removed_at=rows[-1].created_at))
+                self._take_back(observations, known.number, row.removed_at)
+        self._keep_latest(observations, lambda row: (row.kind, row.name, row.scene))
+
+    def _take_back(self, table: Table, number: int, removed_at: str) -> None:
+        self.ours.execute(update(table).where(table.c.number == number).values(removed_at=removed_at))
+
+    def _keep_latest(self, table: Table, subject: Callable[[Row[Any]], Any]) -> None:
+        """Take back all current rows about each subject except the latest."""
+        latest: dict[Any, Row[Any]] = {}
+        current = select(table).where(table.c.removed_at.is_(None))
+        for row in self.ours.execute(current.order_by(table.c.created_at.desc(), table.c.number.desc())).all():
+            if (later := latest.setdefault(subject(row), row)) is not row:
+                self._take_back(table, row.number, later.created_at)
 
     def photos(self) -> None:
         """Copy the photos of the scenes; a photo that either map removed stays removed."""
@@ -445,8 +442,7 @@ class Transfer:
                 continue
             if known is not None:
                 if row.removed_at is not None and known.removed_at is None:
-                    taken_back = photo_sightings.c.number == known.number
-                    self.ours.execute(update(photo_sightings).where(taken_back).values(removed_at=row.removed_at))
+                    self._take_back(photo_sightings, known.number, row.removed_at)
             elif row.removed_at is None and row.digest not in current:
                 self.transfer_group(PHOTOS, row.group_id)
                 self.ours.execute(insert(photo_sightings), _content(row))

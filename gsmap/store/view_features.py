@@ -16,29 +16,18 @@ from gsmap.methods import RecipeKey
 from gsmap.store.array_groups import PackedResult
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
-from gsmap.store.layout import Shape
-from gsmap.store.results import DerivedArrays
+from gsmap.store.results import ArrayTypes, DerivedArrays
 from gsmap.types import Cameras
 from gsmap.types.localization import SceneFeatures
 
 KIND = "views"
-
-_ARRAYS: dict[str, np.dtype[Any]] = {
-    "starts": np.dtype(np.int64),
-    "points": np.dtype(np.float32),
-    "descriptors": np.dtype(np.int8),
-    "angles": np.dtype(np.uint8),
-    "poses": np.dtype(np.float64),
-    "intrinsics": np.dtype(np.float64),
-    "sizes": np.dtype(np.int64),
-}
 
 
 class ViewFeatures(DerivedArrays[SceneFeatures]):
     """The view features of a map, one set per scene."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
-        super().__init__(catalog, arrays, KIND, _ARRAYS, "the features of scene")
+        super().__init__(catalog, arrays, KIND, "the features of scene")
 
     def _pack(self, found: SceneFeatures) -> PackedResult:
         arrays: dict[str, np.ndarray] = {
@@ -60,19 +49,19 @@ class ViewFeatures(DerivedArrays[SceneFeatures]):
             CorruptError: bytes on disk are missing, differ, or are not valid features.
             NotFoundError: another process replaced them meanwhile.
         """
-        return self.get(scene, key, _shapes, _features)
+        return self.get(scene, key, _layout, _features)
 
 
-def _shapes(about: Mapping[str, int]) -> dict[str, Shape]:
+def _layout(about: Mapping[str, int]) -> ArrayTypes:
     V, N = about["num_views"], about["num_items"]
     return {
-        "starts": (V + 1,),
-        "points": (N, 3),
-        "descriptors": (N, None),
-        "angles": (N,),
-        "poses": (V, 16),
-        "intrinsics": (V, 4),
-        "sizes": (V, 2),
+        "starts": (np.int64, (V + 1,)),
+        "points": (np.float32, (N, 3)),
+        "descriptors": (np.int8, (N, None)),
+        "angles": (np.uint8, (N,)),
+        "poses": (np.float64, (V, 16)),
+        "intrinsics": (np.float64, (V, 4)),
+        "sizes": (np.int64, (V, 2)),
     }
 
 

@@ -26,8 +26,7 @@ class MeanColours(DerivedArrays[tuple[str, np.ndarray]]):
     """The mean colour of each scene."""
 
     def __init__(self, store: Store) -> None:
-        types = {"mean": np.dtype(np.float64)}
-        super().__init__(store.catalog, store.arrays, "colours", types, "the mean colour of scene")
+        super().__init__(store.catalog, store.arrays, "colours", "the mean colour of scene")
 
     def _pack(self, found: tuple[str, np.ndarray]) -> PackedResult:
         scene, mean = found
@@ -40,7 +39,7 @@ class MeanColours(DerivedArrays[tuple[str, np.ndarray]]):
         return self.get(
             scene,
             key("colours", scene),
-            lambda about: {"mean": (about["num_items"], 3)},
+            lambda about: {"mean": (np.float64, (about["num_items"], 3))},
             lambda row, arrays: arrays["mean"][0],
         )
 
