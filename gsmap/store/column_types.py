@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -16,7 +17,7 @@ from typing import Any
 from sqlalchemy import LargeBinary, Text
 from sqlalchemy.types import TypeDecorator, TypeEngine
 
-from gsmap.errors import CorruptError, GsmapError, InputError
+from gsmap.errors import MALFORMED, CorruptError, GsmapError, InputError
 from gsmap.texts import control_characters
 
 _DIGEST = re.compile(r"[0-9a-f]{32}|[0-9a-f]{64}")
@@ -242,19 +243,23 @@ class PackedNumbers(TypeDecorator[Any]):
     def process_result_value(self, value: Any, dialect: Any) -> Any:
         if value is None:
             return None
-        with malformed_as_corrupt(self.where):
+        with malformed_as_corrupt(f"a value in {self.where}"):
             return self.unpack(bytes(value))
 
 
 @contextmanager
-def malformed_as_corrupt(where: str) -> Iterator[None]:
-    """Raise `CorruptError` for errors while decoding the bytes of a column."""
+def malformed_as_corrupt(what: str) -> Iterator[None]:
+    """Raise `CorruptError` for errors while decoding a stored value.
+
+    Args:
+        what: description of the value and its row.
+    """
     try:
         yield
-    except GsmapError as error:
+    except (GsmapError, *MALFORMED, zlib.error) as error:
         raise CorruptError(
-            f"the catalog holds bytes in {where} that are not an array ({error}), which gsmap did not write: "
-            "restore the catalog from a backup, and do not trust the map if you received it like this",
+            f"the catalog holds {what} that is invalid ({error}) and that gsmap did not write: restore the catalog "
+            "from a backup, and do not trust the map if you received it like this",
             code="catalog_invalid",
         ) from error
 

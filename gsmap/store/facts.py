@@ -10,8 +10,9 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, insert, select
 
-from gsmap.errors import CorruptError, InputError
+from gsmap.errors import InputError
 from gsmap.store.catalog import now
+from gsmap.store.column_types import malformed_as_corrupt
 from gsmap.store.scene_refs import is_hexadecimal
 from gsmap.store.schema import scene_facts
 from gsmap.texts import control_characters
@@ -78,12 +79,8 @@ def specified_metres(connection: Connection) -> dict[str, str]:
     """
     query = select(scene_facts).where(scene_facts.c.kind == "metres_per_unit").order_by(scene_facts.c.number)
     values = {row.scene: row.value for row in connection.execute(query)}
-    try:
+    with malformed_as_corrupt("an annotation"):
         return {scene: validated_metres(value) for scene, value in values.items() if value}
-    except InputError as error:
-        raise CorruptError(
-            f"the catalog holds an annotation that gsmap did not write: {error}", code="catalog_invalid"
-        ) from error
 
 
 def validated_metres(value: float | str) -> str:

@@ -15,10 +15,10 @@ from typing import Any
 from sqlalchemy import Row, insert, select, update
 
 from gsmap.durable import open_file, refuse_links, write_whole
-from gsmap.errors import CorruptError, NotFoundError
+from gsmap.errors import NotFoundError
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.column_types import is_relative
+from gsmap.store.column_types import corrupt_value, is_relative
 from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.store.facts import validated_text
 from gsmap.store.schema import models
@@ -148,11 +148,7 @@ def model_path(folder: Path, row: Row[Any]) -> Path:
     path: str = row.path
     above, _, name = path.partition("/")
     if above != FOLDER or "/" in name or not is_relative(path):
-        raise CorruptError(
-            f"the catalog holds {path!r} in models.path, which is not a file inside the map and which gsmap did "
-            "not write: restore the catalog from a backup, and do not trust the map if you received it like this",
-            code="catalog_invalid",
-        )
+        raise corrupt_value("models.path", path, "a file inside the map")
     refuse_links(folder, FOLDER, name)
     return folder / path
 

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Row, delete, func, insert, select, update
 
-from gsmap.errors import CorruptError, GsmapError, InputError, NotFoundError
+from gsmap.errors import InputError, NotFoundError
 from gsmap.methods import RecipeKey
 from gsmap.store import facts, recipes
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.column_types import is_object_set
+from gsmap.store.column_types import is_object_set, malformed_as_corrupt
 from gsmap.store.facts import Fact
 from gsmap.store.matrices import from_array, from_pose, to_pose
 from gsmap.store.result_rows import ResultRows
@@ -530,7 +530,7 @@ def _box_or_none(box: np.ndarray | None) -> list[list[float]] | None:
 
 
 def _read(row: Row[Any]) -> ObjectSet:
-    try:
+    with malformed_as_corrupt(f"objects, in results row {row.number},"):
         value, poses = row.about, row.about["poses"]
         scenes = row.scenes.split(" ")
         if set(scenes) != set(poses):
@@ -552,12 +552,6 @@ def _read(row: Row[Any]) -> ObjectSet:
             _boxes(scenes, value.get("surfaces")),
             {str(pair): str(text) for pair, text in value.get("told", {}).items()},
         )
-    except (GsmapError, TypeError, ValueError, KeyError, IndexError, AttributeError, zlib.error) as error:
-        raise CorruptError(
-            f"the catalog holds objects, in results row {row.number}, that are invalid ({error}) and that "
-            "gsmap did not write: restore the catalog from a backup",
-            code="catalog_invalid",
-        ) from error
 
 
 def _objects(rows: Sequence[Mapping[str, Any]], scenes: Sequence[str]) -> tuple[MapObject, ...]:

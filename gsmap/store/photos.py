@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Row, insert, select, update
 
-from gsmap.errors import CorruptError, GsmapError, InputError, NotFoundError
+from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.store import facts
 from gsmap.store.array_groups import manifest, publish, unless_pruned
 from gsmap.store.arrays import Arrays, digest
 from gsmap.store.catalog import Catalog, now
+from gsmap.store.column_types import malformed_as_corrupt
 from gsmap.store.error_translation import NOT_KEPT, translate_errors
 from gsmap.store.scene_refs import living_ids, resolve
 from gsmap.store.schema import photo_sightings
@@ -179,7 +180,7 @@ def _value(sighting: LocalizedPhoto) -> dict[str, Any]:
 
 
 def _stored(row: Row[Any]) -> StoredPhoto:
-    try:
+    with malformed_as_corrupt(f"a photo, in photo_sightings row {row.number},"):
         value = row.value
         when = None if row.captured_at is None else facts.validated_date(row.captured_at)
         things = tuple(
@@ -199,10 +200,4 @@ def _stored(row: Row[Any]) -> StoredPhoto:
             float(value["probability"]),
             things,
         )
-    except (GsmapError, TypeError, ValueError, KeyError, AttributeError) as error:
-        raise CorruptError(
-            f"the catalog holds a photo, in photo_sightings row {row.number}, that is invalid ({error}) and "
-            "that gsmap did not write: restore the catalog from a backup",
-            code="catalog_invalid",
-        ) from error
-    return StoredPhoto(row.number, sighting, row.created_at, row.group_id or "")
+        return StoredPhoto(row.number, sighting, row.created_at, row.group_id or "")

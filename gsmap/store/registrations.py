@@ -652,9 +652,9 @@ def _disagreement(evidence: str) -> float:
 def _stored_all(chosen: Sequence[_CurrentRow]) -> list[StoredRegistration]:
     """Convert rows as `_stored` does, decoding poses and matrices all at once."""
     rows = [one.row for one in chosen]
-    with malformed_as_corrupt("registrations.S_target_source"):
+    with malformed_as_corrupt("a value in registrations.S_target_source"):
         poses = iter(poses_of_bytes([bytes(r.S_target_source) for r in rows if r.S_target_source is not None]))
-    with malformed_as_corrupt("registrations.information"):
+    with malformed_as_corrupt("a value in registrations.information"):
         matrices = iter(matrices_of_bytes([bytes(r.information) for r in rows if r.information is not None]))
     return [
         _stored(

@@ -30,11 +30,11 @@ from sqlalchemy import (
     update,
 )
 
-from gsmap.errors import CorruptError, NotFoundError
+from gsmap.errors import NotFoundError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.column_types import PackedNumbers, malformed_as_corrupt
+from gsmap.store.column_types import PackedNumbers, corrupt_value, malformed_as_corrupt
 from gsmap.store.matrices import covariance_bytes, covariances_of_bytes, pose_bytes, poses_of_bytes
 from gsmap.store.schema import REVISION_COUNTS, edges, poses, revisions
 from gsmap.store.world_ties import world_tie_to_json, world_ties_of_json
@@ -462,9 +462,9 @@ def _pose_graph(connection: Connection, row: Row[Any]) -> PoseGraph:
 def _poses(connection: Connection, where: ColumnElement[bool]) -> dict[str, ScenePose]:
     query = select(*map(_undecoded, poses.columns)).where(where).order_by(poses.c.scene)
     rows = connection.execute(query).all()
-    with malformed_as_corrupt("poses.S_map_scene"):
+    with malformed_as_corrupt("a value in poses.S_map_scene"):
         S_map_scene = iter(poses_of_bytes([bytes(row.S_map_scene) for row in rows if row.S_map_scene is not None]))
-    with malformed_as_corrupt("poses.covariance"):
+    with malformed_as_corrupt("a value in poses.covariance"):
         covariances = iter(covariances_of_bytes([bytes(row.covariance) for row in rows if row.covariance is not None]))
     none: Any = None
     return {
@@ -491,9 +491,5 @@ def _provenance(value: dict[str, Any]) -> Provenance:
     known = {part.name: value[part.name] for part in fields(Provenance) if part.name in value}
     priors = known.get("contradicted_priors", [])
     if not isinstance(priors, list) or not all(isinstance(scene, str) for scene in priors):
-        raise CorruptError(
-            "the catalog holds a revision that gsmap did not write: its contradicted priors are not ids of scenes: "
-            "restore it from a backup",
-            code="catalog_invalid",
-        )
+        raise corrupt_value("revisions.provenance", priors, "a list of ids of scenes")
     return Provenance(**known | {"contradicted_priors": tuple(priors)})

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Row, insert, select, update
 
-from gsmap.errors import CorruptError, GsmapError, NotFoundError
+from gsmap.errors import NotFoundError
 from gsmap.store.catalog import Catalog, now
+from gsmap.store.column_types import malformed_as_corrupt
 from gsmap.store.scene_refs import living_ids
 from gsmap.store.schema import observations
 from gsmap.types.plain import plain
@@ -161,7 +162,7 @@ def _row(item: Observation) -> dict[str, Any]:
 
 
 def _item(row: Row[Any]) -> Any:
-    try:
+    with malformed_as_corrupt(f"an observation ({row.kind} {row.name!r})"):
         values: dict[str, Any] = {
             name: _tuple(value)
             if name in _TUPLES and isinstance(value, list)
@@ -176,13 +177,7 @@ def _item(row: Row[Any]) -> Any:
         made = _TYPES[row.kind](**values)
         if _row(made)["scene"] != row.scene or _row(made)["other"] != row.other or _row(made)["name"] != row.name:
             raise ValueError("the name or scene differs from that of its row")
-    except (GsmapError, TypeError, ValueError, KeyError) as error:
-        raise CorruptError(
-            f"the catalog holds an observation ({row.kind} {row.name!r}) that is invalid ({error}) and that "
-            "gsmap did not write: restore the catalog from a backup",
-            code="catalog_invalid",
-        ) from error
-    return made
+        return made
 
 
 def _is_array(name: str, value: Any) -> bool:

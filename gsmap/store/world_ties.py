@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.errors import CorruptError, GsmapError
+from gsmap.store.column_types import malformed_as_corrupt
 from gsmap.store.matrices import from_array, from_pose, to_array, to_pose
 from gsmap.types.plain import plain
 from gsmap.types.world import Contradiction, Georeference, Residual, WorldFrame
@@ -39,14 +39,8 @@ def world_ties_of_json(values: list[dict[str, Any]]) -> tuple[Georeference, ...]
     Raises:
         CorruptError: not written by gsmap.
     """
-    try:
+    with malformed_as_corrupt("a georeference, in revisions.world,"):
         return tuple(_tie(value) for value in values)
-    except (GsmapError, TypeError, ValueError, KeyError, AttributeError) as error:
-        raise CorruptError(
-            f"the catalog holds a georeference, in revisions.world, that is invalid ({error!r}) and that gsmap did "
-            "not write: restore the catalog from a backup",
-            code="catalog_invalid",
-        ) from error
 
 
 def _tie(value: dict[str, Any]) -> Georeference:
