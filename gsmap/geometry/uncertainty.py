@@ -11,9 +11,6 @@ from gsmap.types import ScenePose
 def middle_covariance_m2(pose: ScenePose, middle: np.ndarray, metres_per_unit: float) -> np.ndarray | None:
     """Return the (3, 3) covariance, in square metres along the component's axes, of a point that is fixed to a scene.
 
-    To first order, ``S Exp(xi) m = S (m + rot x m + trans + log_scale m)`` for a tangent on the scene side
-    (`gsmap.types.ScenePose`), so the point moves by ``s R [-skew(m) | I | m] xi``.
-
     Args:
         middle: (3,) the point, in the scene's frame and unit.
         metres_per_unit: metres per unit of the component's frame.
@@ -21,6 +18,15 @@ def middle_covariance_m2(pose: ScenePose, middle: np.ndarray, metres_per_unit: f
     if pose.covariance is None:
         return None
     S = pose.S_map_scene
-    moves = S.scale * S.rotation @ np.concatenate([-skew(middle), np.eye(3), middle[:, None]], axis=1)
+    moves = S.scale * S.rotation @ point_jacobian(middle)
     found: np.ndarray = metres_per_unit**2 * moves @ pose.covariance @ moves.T
     return found if np.isfinite(found).all() else None
+
+
+def point_jacobian(point: np.ndarray) -> np.ndarray:
+    """Return the Jacobian (3, 7) of a point (3,) of a frame, in that frame, with respect to the pose of the frame.
+
+    To first order, ``S Exp(xi) m = S (m + rot x m + trans + log_scale m)`` for a tangent on the frame's side
+    (`gsmap.types.ScenePose`), so the point moves by ``[-skew(m) | I | m] xi``.
+    """
+    return np.concatenate([-skew(point), np.eye(3), point[:, None]], axis=1)

@@ -80,6 +80,14 @@ class PictureFolder:
         text = json.dumps(content, indent=1)
         write_owned(folder / FILE_NAME, self.map_id, lambda staged: staged.write_text(text, encoding="utf-8"))
 
+    def add(self, store: Store, folder: Path, scenes: Mapping[str, list[str]]) -> None:
+        """Record images before they are drawn, so that a purge knows what an interrupted run leaves."""
+        make_folder(folder)
+        if (refused := note_target(store, folder, {"pictures": True})) is not None:  # like the folder of an export
+            _log.warning("%s: the folder is not recorded in the map, so a purge will not find these images", refused)
+        self.scenes |= scenes
+        self.save(folder)
+
     def forget(self, folder: Path, scene: str) -> int:
         """Delete the images that show a scene; return their number."""
         gone = [name for name, ids in self.scenes.items() if scene in ids]
@@ -102,10 +110,7 @@ def draw(store: Store, folder: Path, rows: Sequence[ChangeRow], progress: StageP
     """
     known = PictureFolder.load(folder, store.id)
     rows = [row for row in rows if row.box_m is not None]
-    make_folder(folder)
-    _note(store, folder)
-    known.scenes |= {f"{row.id}.png": [row.older, row.newer] for row in rows}
-    known.save(folder)  # first: what an interrupted run leaves is known to a purge
+    known.add(store, folder, {f"{row.id}.png": [row.older, row.newer] for row in rows})
     files: dict[str, str] = {}
     for pair in dict.fromkeys((row.older, row.newer) for row in rows):
         drawer = PairRenderer(store, *pair)
@@ -131,10 +136,7 @@ def draw_pair(store: Store, folder: Path, a: Scene, b: Scene) -> str | None:
     edge = stored.registration
     called = "-".join(_UNSAFE.sub("_", store.scenes.get(end).name)[:40] for end in (edge.target, edge.source))
     name = f"why-{called}-{text_digest(edge.target + edge.source)[:8]}.png"
-    make_folder(folder)
-    _note(store, folder)
-    known.scenes[name] = [edge.target, edge.source]
-    known.save(folder)
+    known.add(store, folder, {name: [edge.target, edge.source]})
     write_owned(folder / name, store.id, partial(_save, picture))
     return str(folder / name)
 
@@ -247,10 +249,7 @@ def draw_places(
     names = [
         f"find-{text_digest(f'{scene} {box.tolist()}')[:16]}.png" for scene, box in zip(scenes, boxes, strict=True)
     ]
-    make_folder(folder)
-    _note(store, folder)
-    known.scenes |= {name: [scene] for name, scene in zip(names, scenes, strict=True)}
-    known.save(folder)  # first: what an interrupted run leaves is known to a purge
+    known.add(store, folder, {name: [scene] for name, scene in zip(names, scenes, strict=True)})
     for done, scene in enumerate(dict.fromkeys(scenes)):
         progress("pictures", done / len(scenes), scene[:12])
         placed = posed_scene(store, scene, in_metres(poses.poses[scene].S_map_scene, metres[scene]))
@@ -301,12 +300,6 @@ def posed_scene(store: Store, scene: str, S: Sim3) -> PosedScene:
     """Read a scene and transform it by ``S``."""
     gaussians, cameras = store.scenes.gaussians(scene), store.scenes.cameras(scene)
     return PosedScene(transform_gaussians(gaussians, S), transform_cameras(cameras, S), scene)
-
-
-def _note(store: Store, folder: Path) -> None:
-    """Record the folder in the catalog, like the folder of an export."""
-    if (refused := note_target(store, folder, {"pictures": True})) is not None:
-        _log.warning("%s: the folder is not recorded in the map, so a purge will not find these images", refused)
 
 
 def note_target(store: Store, path: Path, settings: Mapping[str, Any]) -> str | None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from gsmap import optimize
 from gsmap.errors import ConfigError, NotFoundError
+from gsmap.geometry.uncertainty import point_jacobian
 from gsmap.map.metric_scales import map_metres
 from gsmap.map.settings import Settings
 from gsmap.map.specified_points import SpecifiedPoint, parse_point
@@ -206,7 +207,7 @@ def _pose_variance(solved: _PoseUncertainty, placed: list[_LocatedPoint]) -> flo
         return float("inf")
     J = np.zeros(joint.shape[0])
     for k, (end, sign) in enumerate(moved):
-        J[7 + 7 * k : 14 + 7 * k] = sign * along @ _turn(solved.graph, end) @ _moves(end.place.point)
+        J[7 + 7 * k : 14 + 7 * k] = sign * along @ _turn(solved.graph, end) @ point_jacobian(end.place.point)
     return variance + float(J @ joint @ J)
 
 
@@ -229,7 +230,7 @@ def _world_covariance(solved: _PoseUncertainty, end: _LocatedPoint) -> np.ndarra
     W = tie.S_world_map
     big = W.scale * W.rotation
     if end.place.scene is None:
-        J = big @ _moves(end.map)
+        J = big @ point_jacobian(end.map)
         out: np.ndarray = J @ tie.covariance @ J.T
         return out
     turn = _turn(solved.graph, end)
@@ -237,7 +238,7 @@ def _world_covariance(solved: _PoseUncertainty, end: _LocatedPoint) -> np.ndarra
     if joint is None or not np.isfinite(joint).all():  # as in a part of a map without its control points
         return None
     picked = big @ turn @ end.place.covariance @ turn.T @ big.T
-    J = np.concatenate([big @ _moves(end.map), big @ turn @ _moves(end.place.point)], axis=1)
+    J = np.concatenate([big @ point_jacobian(end.map), big @ turn @ point_jacobian(end.place.point)], axis=1)
     found: np.ndarray = J @ joint @ J.T + picked
     return found
 
@@ -248,13 +249,6 @@ def _turn(graph: PoseGraph, end: _LocatedPoint) -> np.ndarray:
         return np.eye(3)
     S = graph.poses[end.place.scene].S_map_scene
     return S.scale * S.rotation
-
-
-def _moves(point: np.ndarray) -> np.ndarray:
-    """Return the Jacobian (3, 7) of a point with respect to the pose of the point's frame."""
-    from gsmap.geometry.rotations import skew
-
-    return np.concatenate([-skew(point[None])[0], np.eye(3), point[:, None]], axis=1)
 
 
 def _row(solved: _PoseUncertainty, end: _LocatedPoint, frame: WorldFrame | None, crs: str | None) -> PointRow:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from gsmap.formats.pictures import open_picture
 from gsmap.geometry.transforms import transform_poses
 from gsmap.store import Store
 from gsmap.types import ScenePose
+from gsmap.types.rows.localize import LocalizeRow
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,23 +40,6 @@ LocalizePhotos = Callable[[Sequence[str]], dict[str, PhotoPose]]
 """A function that maps the names of photos, as the files have them, to the poses of photos that were localized."""
 
 
-class PhotoPoseRow(Protocol):
-    """The fields of a localization row that `photo_pose_of` uses."""
-
-    @property
-    def file(self) -> str: ...
-    @property
-    def T_map_camera(self) -> np.ndarray | None: ...
-    @property
-    def covariance(self) -> np.ndarray | None: ...
-    @property
-    def component(self) -> int | None: ...
-    @property
-    def scenes(self) -> Sequence[str]: ...
-    @property
-    def intrinsics_px(self) -> np.ndarray | None: ...
-
-
 def photo_localizer(store: Store, localize: Callable[..., Any], folder: str | os.PathLike[str]) -> LocalizePhotos:
     """Return a function that localizes photos of a folder in the map.
 
@@ -73,7 +57,7 @@ def photo_localizer(store: Store, localize: Callable[..., Any], folder: str | os
         files = {name: root / name for name in names if _inside(root, name)}
         if not files:
             return {}
-        rows: Sequence[PhotoPoseRow] = localize(*files.values()).results
+        rows: Sequence[LocalizeRow] = localize(*files.values()).results
         poses, ids = store.revisions.poses(), {scene.name: scene.id for scene in store.scenes.list()}
         found = {}
         for (name, path), row in zip(files.items(), rows, strict=True):
@@ -86,7 +70,7 @@ def photo_localizer(store: Store, localize: Callable[..., Any], folder: str | os
 
 
 def photo_pose_of(
-    row: PhotoPoseRow, size_px: tuple[int, int], poses: Mapping[str, ScenePose], ids: Mapping[str, str]
+    row: LocalizeRow, size_px: tuple[int, int], poses: Mapping[str, ScenePose], ids: Mapping[str, str]
 ) -> PhotoPose | None:
     """Return the pose of a photo in the frame of its best supporting scene, with which the photo moves when poses
     change; None if the photo was refused.
