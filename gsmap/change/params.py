@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsmap.errors import ConfigError
+from gsmap.settings.ranges import require_range
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,4 @@ class Params:
     min_confidence: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("longest_side_px", "max_views", "voxel_m"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"change.{name} must be positive, got {getattr(self, name)}", code="out_of_range")
+        require_range(self, "(0, inf]", "longest_side_px", "max_views", "voxel_m")

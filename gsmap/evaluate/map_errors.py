@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.errors import ConfigError
 from gsmap.evaluate.calibration import (
     Nees,
     nees_of_edge,
@@ -19,6 +18,7 @@ from gsmap.evaluate.calibration import (
     truth_covariance,
 )
 from gsmap.evaluate.registration import absolute_trajectory_error, pose_error
+from gsmap.settings.ranges import require_range
 from gsmap.types import PoseGraph, Sim3
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows.evaluation import (
@@ -58,17 +58,8 @@ class Params:
     bands: tuple[float, ...] = (0.1, 0.25, 0.5)
 
     def __post_init__(self) -> None:
-        if not (self.max_rre_deg > 0 and self.max_rte_m > 0):
-            raise ConfigError(
-                f"max_rre_deg and max_rte_m must be positive, got {self.max_rre_deg} deg, {self.max_rte_m} m",
-                code="out_of_range",
-            )
-        if not (0 <= self.truth_sigma_deg < np.inf and 0 <= self.truth_sigma_m < np.inf):
-            raise ConfigError(
-                f"truth_sigma_deg and truth_sigma_m must not be negative, got {self.truth_sigma_deg} deg, "
-                f"{self.truth_sigma_m} m",
-                code="out_of_range",
-            )
+        require_range(self, "(0, inf]", "max_rre_deg", "max_rte_m")
+        require_range(self, "[0, inf)", "truth_sigma_deg", "truth_sigma_m")
 
 
 @dataclass(frozen=True, eq=False)

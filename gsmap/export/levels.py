@@ -14,12 +14,12 @@ from functools import cache
 
 import numpy as np
 
-from gsmap.errors import ConfigError
 from gsmap.formats import tiles3d
 from gsmap.geometry.projection import in_image, project
 from gsmap.render import ChunkIndex, render
 from gsmap.render.fit import make_fitter, with_enough_memory
 from gsmap.render.fitter import FitOptions, LearningRates
+from gsmap.settings.ranges import require_range
 from gsmap.types import Cameras, Gaussians
 
 VERSION = 5
@@ -50,9 +50,7 @@ class Params:
     steps: int = 200
 
     def __post_init__(self) -> None:
-        for name in ("views", "steps"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}", code="out_of_range")
+        require_range(self, "[0, inf]", "views", "steps")
 
 
 @dataclass(frozen=True, eq=False)

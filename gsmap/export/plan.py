@@ -12,6 +12,7 @@ from gsmap.errors import ConfigError, InputError
 from gsmap.export import levels
 from gsmap.export.cells import CellSet, Grid, OrientedBoxes
 from gsmap.geometry.origins import float32_step, origin_of
+from gsmap.settings.ranges import require_range
 from gsmap.types import Sim3
 
 _MAX_ROUNDED_M = 1e-3
@@ -41,8 +42,7 @@ class Params:
     levels: levels.Params = field(default_factory=levels.Params)
 
     def __post_init__(self) -> None:
-        if not self.max_shift_m >= 0:
-            raise ConfigError(f"max_shift_m must not be negative, got {self.max_shift_m}", code="out_of_range")
+        require_range(self, "[0, inf]", "max_shift_m")
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,8 @@ from datetime import datetime
 
 import numpy as np
 
-from gsmap.errors import ConfigError
 from gsmap.geometry.boxes import box_corners, moved_box
+from gsmap.settings.ranges import require_range
 from gsmap.types import Sim3
 
 _SAMPLES = 12  # points along each axis of a visit's box by which its coverage is estimated
@@ -34,15 +34,8 @@ class Params:
     max_earlier_visits: int = 8
 
     def __post_init__(self) -> None:
-        if not 0 < self.min_new_fraction <= 1:
-            raise ConfigError(
-                f"visits.min_new_fraction must be a fraction in (0, 1], got {self.min_new_fraction}",
-                code="out_of_range",
-            )
-        if not self.max_earlier_visits >= 0:
-            raise ConfigError(
-                f"visits.max_earlier_visits must not be negative, got {self.max_earlier_visits}", code="out_of_range"
-            )
+        require_range(self, "(0, 1]", "min_new_fraction")
+        require_range(self, "[0, inf]", "max_earlier_visits")
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsmap.errors import ConfigError
+from gsmap.settings.ranges import require_range
 
 
 @dataclass(frozen=True)
@@ -56,19 +56,7 @@ class Params:
     max_unchanged_sigmas: float = 1e-3
 
     def __post_init__(self) -> None:
-        for name in ("gate_probability", "min_wrong_probability", "max_disagreement"):
-            if not 0 < getattr(self, name) < 1:
-                raise ConfigError(f"{name} must lie between 0 and 1, got {getattr(self, name)}", code="out_of_range")
-        for name in (
-            "max_growth",
-            "max_full_scenes",
-            "max_marginal_scenes",
-            "same_visit_h",
-            "max_tilt_deg",
-            "max_unchanged_sigmas",
-        ):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"{name} must be at least 0, got {getattr(self, name)}", code="out_of_range")
-        for name in ("min_large_component", "min_bridge_edges"):
-            if not getattr(self, name) >= 1:
-                raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}", code="out_of_range")
+        require_range(self, "(0, 1)", "gate_probability", "min_wrong_probability", "max_disagreement")
+        require_range(self, "[0, inf]", "max_growth", "max_full_scenes", "max_marginal_scenes")
+        require_range(self, "[0, inf]", "same_visit_h", "max_tilt_deg", "max_unchanged_sigmas")
+        require_range(self, "[1, inf]", "min_large_component", "min_bridge_edges")

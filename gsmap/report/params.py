@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsmap.errors import ConfigError
+from gsmap.settings.ranges import require_range
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,4 @@ class Params:
     edges: int = 3000
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if value < 0:
-                raise ConfigError(f"report.{name} must not be negative, got {value}", code="out_of_range")
+        require_range(self, "[0, inf]", *vars(self))

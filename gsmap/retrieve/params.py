@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-from gsmap.errors import ConfigError
+from gsmap.settings.ranges import require_range
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,5 @@ class Params:
     num_neighbours: int = 12
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            least = 1 if field.name in ("max_edges_per_scene", "nodes_per_scene") else 0
-            if not getattr(self, field.name) >= least:
-                raise ConfigError(
-                    f"retrieve.{field.name} must be at least {least}, got {getattr(self, field.name)}",
-                    code="out_of_range",
-                )
+        require_range(self, "[0, inf]", *vars(self))
+        require_range(self, "[1, inf]", "max_edges_per_scene", "nodes_per_scene")

@@ -9,8 +9,8 @@ import numpy as np
 
 from gsmap.compare import HIDDEN, UNSEEN, CaptureViews, compare, render_views
 from gsmap.compare.capture_views import CELL_M, max_per_cell
-from gsmap.errors import ConfigError
 from gsmap.render import render
+from gsmap.settings.ranges import require_range
 from gsmap.types import Gaussians, PosedScene
 
 __all__ = ["Params", "measure_fidelity_db", "render_views", "observed_fraction", "find_visible"]
@@ -41,12 +41,8 @@ class Params:
     longest_side_px: int = 480
 
     def __post_init__(self) -> None:
-        for name in ("min_seen_again", "min_weight"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must lie in [0, 1], got {getattr(self, name)}", code="out_of_range")
-        for name in ("max_views", "longest_side_px"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}", code="out_of_range")
+        require_range(self, "[0, 1]", "min_seen_again", "min_weight")
+        require_range(self, "(0, inf]", "max_views", "longest_side_px")
 
 
 def observed_fraction(older: PosedScene, newer: Sequence[CaptureViews]) -> float:

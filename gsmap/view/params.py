@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsmap.errors import ConfigError
+from gsmap.settings.ranges import require_range
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,6 @@ class Params:
     site_changes: int = 48
 
     def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise ConfigError(f"view.workers must be at least 1, got {self.workers}", code="out_of_range")
-        if not self.cache_gib > 0:
-            raise ConfigError(f"view.cache_gib must be positive, got {self.cache_gib}", code="out_of_range")
-        for name in ("picture_gaussians", "site_pairs", "site_changes"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"view.{name} must not be negative, got {getattr(self, name)}", code="out_of_range")
+        require_range(self, "[1, inf]", "workers")
+        require_range(self, "(0, inf]", "cache_gib")
+        require_range(self, "[0, inf]", "picture_gaussians", "site_pairs", "site_changes")

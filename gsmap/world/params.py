@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsmap.errors import ConfigError
+from gsmap.settings.ranges import require_range
 
 PIXEL_SIGMA_PX = 1.0
 """Standard deviation in pixels of a control point in a photo, due to picking and to the camera."""
@@ -40,6 +40,4 @@ class Params:
     survey_sigma_m: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value > 0:
-                raise ConfigError(f"{name} must be positive, got {value}", code="out_of_range")
+        require_range(self, "(0, inf]", *vars(self))

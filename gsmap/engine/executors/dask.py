@@ -21,6 +21,7 @@ from typing import Any
 from gsmap.engine.worker import answer
 from gsmap.errors import ConfigError, GsmapError, MissingDependencyError, NotFoundError
 from gsmap.methods.executor import QuarantinedJob
+from gsmap.settings.ranges import require_range
 from gsmap.version import __version__
 
 VERSION = 1
@@ -51,8 +52,7 @@ class Params:
     timeout_s: float = 30.0
 
     def __post_init__(self) -> None:
-        if not self.timeout_s > 0:
-            raise ConfigError(f"timeout_s must be positive, got {self.timeout_s}", code="out_of_range")
+        require_range(self, "(0, inf]", "timeout_s")
 
 
 class DaskWorkers:

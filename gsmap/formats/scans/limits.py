@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-from gsmap.errors import ConfigError
+from gsmap.settings.ranges import require_range
 
 MAX_POINTS = 2_000_000
 """Largest number of points that are read from a cloud (evenly spaced if it has more), and of samples of a mesh."""
@@ -25,8 +25,4 @@ class Params:
     max_memory_mb: int = 8192
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if not getattr(self, field.name) > 0:
-                raise ConfigError(
-                    f"scan.reading.{field.name} must be positive, got {getattr(self, field.name)}", code="out_of_range"
-                )
+        require_range(self, "(0, inf]", *vars(self))

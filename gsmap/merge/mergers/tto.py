@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.errors import ConfigError
 from gsmap.geometry.boxes import inside
 from gsmap.geometry.voxels import merge_groups, voxel_labels
 from gsmap.merge import references
@@ -28,6 +27,7 @@ from gsmap.merge.references import WEIGHT_UNIT, References, render_references, v
 from gsmap.merge.selection import near_other_scene, select_owners
 from gsmap.render.fit import make_fitter, with_enough_memory
 from gsmap.render.fitter import FitOptions, LearningRates
+from gsmap.settings.ranges import require_range
 from gsmap.types import Gaussians, MergeResult, PosedScene
 from gsmap.types.progress import Progress
 
@@ -105,19 +105,12 @@ class Params:
     prefer: Prefer = "newest"
 
     def __post_init__(self) -> None:
-        if self.steps is not None and self.steps < 0:
-            raise ConfigError(f"steps must not be negative, got {self.steps}", code="out_of_range")
-        for name in ("voxel_m", "longest_side_px", "max_views"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}", code="out_of_range")
-        for name in ("max_passes", "halo_m", "min_weight", "huber_delta", "photo_weight"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}", code="out_of_range")
-        for name in ("kept_fraction", "ssim_weight"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must lie in [0, 1], got {getattr(self, name)}", code="out_of_range")
-        if not 0 <= self.momentum < 1:
-            raise ConfigError(f"momentum must be in [0, 1), got {self.momentum}", code="out_of_range")
+        if self.steps is not None:
+            require_range(self, "[0, inf]", "steps")
+        require_range(self, "(0, inf]", "voxel_m", "longest_side_px", "max_views")
+        require_range(self, "[0, inf]", "max_passes", "halo_m", "min_weight", "huber_delta", "photo_weight")
+        require_range(self, "[0, 1]", "kept_fraction", "ssim_weight")
+        require_range(self, "[0, 1)", "momentum")
 
 
 def reach_m(params: Params) -> float:
