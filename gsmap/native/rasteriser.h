@@ -7,6 +7,7 @@
 #include "correspondences.h"
 #include "matches.h"
 #include "merging.h"
+#include "sift.h"
 
 namespace gsmap {
 
@@ -137,6 +138,8 @@ struct Kernels {
     // Of local features: extrema among three levels of a picture, and slopes as lengths and angles.
     int (*peaks)(const float *const *rows, float bar, int from, int to, int32_t *found);
     void (*polar)(const float *dx, const float *dy, int count, float *length, float *angle);
+    void (*add_slopes)(const SlopeGrid &, const float *length, const float *angle, int from, int count, float across,
+                       float down, float *bins);
     int64_t (*near)(uint64_t mine, const uint64_t *theirs, int64_t count, int most, int32_t *which, uint8_t *differ);
     // What it costs to draw one in place of each pair, blurred by a variance.
     void (*pair_costs)(const Blob *, Pair *, int64_t count, double blur, double cover);

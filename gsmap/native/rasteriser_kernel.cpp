@@ -9,6 +9,7 @@
 #include "rasteriser_blend.h"
 #include "rasteriser_blend_backward.h"
 #include "rasteriser_project_backward.h"
+#include "sift_kernel.h"
 #include "signatures_kernel.h"
 
 #define GSMAP_STRING_(x) #x
@@ -20,7 +21,7 @@ static const gsmap::Kernels table = {GSMAP_STRING(GSMAP_ISA), GSMAP_ISA::project
                                      GSMAP_ISA::blend_limit, GSMAP_ISA::blend_backward, GSMAP_ISA::project_backward,
                                      GSMAP_ISA::adam, GSMAP_ISA::huber, GSMAP_ISA::ssim, GSMAP_ISA::agree,
                                      GSMAP_ISA::vote, GSMAP_ISA::weigh, GSMAP_ISA::highest,
-                                     GSMAP_ISA::peaks, GSMAP_ISA::polar, GSMAP_ISA::near,
+                                     GSMAP_ISA::peaks, GSMAP_ISA::polar, GSMAP_ISA::add_slopes, GSMAP_ISA::near,
                                      GSMAP_ISA::pair_costs, GSMAP_ISA::find_nearest, GSMAP_ISA::settle_nearest,
                                      GSMAP_ISA::within, GSMAP_ISA::blur_across, GSMAP_ISA::blur_along,
                                      GSMAP_ISA::nearest};

@@ -14,6 +14,7 @@
 #include "arrays.h"
 #include "filters.h"
 #include "rasteriser_view.h"
+#include "sift.h"
 
 namespace gsmap {
 namespace {
@@ -22,7 +23,7 @@ using Grey = nb::ndarray<const uint8_t, nb::shape<-1, -1>, nb::c_contig, nb::dev
 
 constexpr int kLevels = 3, kOctaves = 4;      // levels of an octave that features lie on
 constexpr int kBlurred = kLevels + 3;         // ... and those that are made: one below, two above
-constexpr int kCells = 4, kTurns = 8;         // of a descriptor
+constexpr int kCells = kSlopeCells, kTurns = kSlopeTurns;
 constexpr int kSlack = 64;                    // floats past a row that vectors may read
 constexpr float kPi = 3.14159265f;
 const float kStep = std::pow(2.f, 1.f / kLevels), kSigma = 1.6f * kStep, kSigmaStep = kSigma * std::sqrt(1 - 1 / (kStep * kStep));
@@ -32,7 +33,7 @@ struct Image {
     int width = 0, height = 0;
     std::unique_ptr<float[]> values;
     Image() = default;
-    Image(int w, int h) : width(w), height(h), values(new float[std::size_t(w) * h]) {}
+    Image(int w, int h) : width(w), height(h), values(new float[std::size_t(w) * h + kSlack]) {}
     float *row(int y) { return values.get() + std::size_t(y) * width; }
     const float *row(int y) const { return values.get() + std::size_t(y) * width; }
 };
@@ -264,6 +265,7 @@ void described(const Slopes &slopes, const Keypoint &at, float turned, float *ou
     const int reach = int(std::sqrt(2.f) * cell * (kCells + 1) / 2 + 0.5f), xi = int(at.x + 0.5f), yi = int(at.y + 0.5f);
     constexpr float kHalf = kCells / 2.f + 0.5f;  // what lies farther from the middle is in no cell
     float bins[kCells + 2][kCells + 2][kTurns + 1] = {};
+    const SlopeGrid grid{at.x, cosine, sine, turned, fading.table, Fading::kSize / Fading::kMost, Fading::kSize};
     for (int y = std::max(-reach, 1 - yi); y <= std::min(reach, height - yi - 2); ++y) {
         const float dy = yi + y - at.y;
         float low = float(std::max(-reach, 1 - xi)), high = float(std::min(reach, width - xi - 2));
@@ -277,23 +279,10 @@ void described(const Slopes &slopes, const Keypoint &at, float turned, float *ou
             low = std::max(low, std::ceil(std::min(one, other) + shift));
             high = std::min(high, std::floor(std::max(one, other) + shift));
         }
-        const float *length = slopes.length.row(yi + y) + xi, *angle = slopes.angle.row(yi + y) + xi;
-        for (int x = int(low); x <= int(high); ++x) {
-            const float dx = xi + x - at.x, nx = cosine * dx + sine * dy, ny = cosine * dy - sine * dx;
-            if (std::abs(nx) >= kHalf || std::abs(ny) >= kHalf) continue;
-            float turn = angle[x] - turned;
-            turn = (turn < 0 ? turn + 2 * kPi : turn) * (kTurns / (2 * kPi));
-            const float weight = length[x] * fading((nx * nx + ny * ny) / 8);
-            const float px = nx + kHalf, py = ny + kHalf;  // in [0, 5)
-            const int column = int(px), row = int(py), sector = std::min(int(turn), kTurns - 1);
-            const float rx = px - column, ry = py - row, rt = turn - sector;
-            float *upper = &bins[row][column][sector], *lower = &bins[row + 1][column][sector];
-            const float up = weight * (1 - ry), down = weight * ry;
-            upper[0] += up * (1 - rx) * (1 - rt), upper[1] += up * (1 - rx) * rt;
-            upper[kTurns + 1] += up * rx * (1 - rt), upper[kTurns + 2] += up * rx * rt;
-            lower[0] += down * (1 - rx) * (1 - rt), lower[1] += down * (1 - rx) * rt;
-            lower[kTurns + 1] += down * rx * (1 - rt), lower[kTurns + 2] += down * rx * rt;
-        }
+        if (low > high) continue;
+        const int from = xi + int(low);
+        kernels->add_slopes(grid, slopes.length.row(yi + y) + from, slopes.angle.row(yi + y) + from, from,
+                            int(high) - int(low) + 1, sine * dy, cosine * dy, bins[0][0]);
     }
     constexpr int kAll = kCells * kCells * kTurns;
     float squares = 0, shares = 0;
