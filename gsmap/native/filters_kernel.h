@@ -4,17 +4,25 @@
 
 namespace GSMAP_ISA {
 
-// out[i] = the sum of weights[k] * rows[k][i], in order of k.
+// `kVectors` vectors of sums from i on: as many as hide how long an addition takes.
+template <int kVectors>
+INLINE void weigh_some(const float *const *rows, const float *weights, int n, int64_t i, float *out) {
+    V sum[kVectors] = {};
+    for (int k = 0; k < n; ++k) {
+        const V weight = set1(weights[k]);
+        for (int l = 0; l < kVectors; ++l) sum[l] = fma(weight, loadu(rows[k] + i + l * W), sum[l]);
+    }
+    for (int l = 0; l < kVectors; ++l) storeu(out + i + l * W, sum[l]);
+}
+
+// out[i] = the sum of weights[k] * rows[k][i], in order of k. What is left of a row ends in a vector that overlaps.
 void weigh(const float *const *rows, const float *weights, int n, int64_t count, float *out) {
     int64_t i = 0;
-    for (; i + 4 * W <= count; i += 4 * W) {
-        V sum[4] = {};
-        for (int k = 0; k < n; ++k) {
-            const V weight = set1(weights[k]);
-            for (int l = 0; l < 4; ++l) sum[l] = fma(weight, loadu(rows[k] + i + l * W), sum[l]);
-        }
-        for (int l = 0; l < 4; ++l) storeu(out + i + l * W, sum[l]);
-    }
+    for (; i + 8 * W <= count; i += 8 * W) weigh_some<8>(rows, weights, n, i, out);
+    if (i + 4 * W <= count) weigh_some<4>(rows, weights, n, i, out), i += 4 * W;
+    if (i + 2 * W <= count) weigh_some<2>(rows, weights, n, i, out), i += 2 * W;
+    if (i + W <= count) weigh_some<1>(rows, weights, n, i, out), i += W;
+    if (i < count && count >= W) weigh_some<1>(rows, weights, n, count - W, out), i = count;
     for (; i < count; ++i) {
         V sum{};
         for (int k = 0; k < n; ++k) sum = fma(set1(weights[k]), set1(rows[k][i]), sum);
