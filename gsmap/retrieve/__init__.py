@@ -4,7 +4,6 @@ from gsmap.retrieve.index import new_segment
 from gsmap.retrieve.lookup import VERSION, look_up
 from gsmap.retrieve.neighbours import ScenePosition, neighbours
 from gsmap.retrieve.pair_schedule import PairSchedule, directed
-from gsmap.retrieve.pairs import candidate_pairs
 from gsmap.retrieve.params import Params
 from gsmap.retrieve.recipe import index_recipe, recipe_key
 from gsmap.retrieve.scene_nodes import SceneNodes, select_nodes
@@ -15,7 +14,6 @@ __all__ = [
     "ScenePosition",
     "PairSchedule",
     "SceneNodes",
-    "candidate_pairs",
     "directed",
     "index_recipe",
     "look_up",

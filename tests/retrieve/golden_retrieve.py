@@ -4,8 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 from retrieve_worlds import walk
+from retrieved_pairs import candidate_pairs
 
-from gsmap.retrieve import Params, ScenePosition, candidate_pairs
+from gsmap.retrieve import Params, ScenePosition
 
 
 def _pairs() -> dict[str, np.ndarray]:

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 from retrieve_worlds import layer, walk
+from retrieved_pairs import candidate_pairs
 
-from gsmap.retrieve import Params, ScenePosition, candidate_pairs, neighbours
+from gsmap.retrieve import Params, ScenePosition, neighbours
 from gsmap.retrieve.neighbours import REACH_SIGMAS
 from gsmap.types import NodeLayer, SceneGraph
 

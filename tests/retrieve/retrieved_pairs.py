@@ -1,15 +1,10 @@
-"""Find candidate pairs of scene graphs in memory, with a temporary index."""
+"""The candidate pairs of scene graphs in memory, with a temporary index."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-from gsmap.retrieve.index import new_segment
-from gsmap.retrieve.lookup import look_up
-from gsmap.retrieve.neighbours import ScenePosition, neighbours
-from gsmap.retrieve.pair_schedule import Pair, directed
-from gsmap.retrieve.params import Params
-from gsmap.retrieve.scene_nodes import select_nodes
+from gsmap.retrieve import Params, ScenePosition, directed, look_up, neighbours, new_segment, select_nodes
 from gsmap.types import SceneGraph
 
 
@@ -19,22 +14,22 @@ def candidate_pairs(
     new: Collection[str] | None = None,
     positions: Mapping[str, ScenePosition] | None = None,
     params: Params | None = None,
-) -> list[Pair]:
+) -> list[tuple[str, str]]:
     """Return pairs of scene ids that may overlap: each scene with its best candidates and with its neighbours by pose.
 
     Args:
         graphs: graphs of all scenes, in any order.
         new: ids of the query scenes; all by default.
         positions: positions of the scenes with poses, by scene id.
+        params: settings of retrieval.
 
     Returns:
-        Pairs (lower id, higher id), each once, best first; equally good pairs are sorted by id. A scene's id is the
-        digest of its content, so the same scenes give the same pairs in any order of input.
+        Pairs (lower id, higher id), each once, best first; equally good pairs are sorted by id.
     """
     params = params or Params()
     scenes = [select_nodes(graph, "", params.nodes_per_scene) for graph in sorted(graphs, key=lambda g: g.scene_id)]
     queries = [one for one in scenes if new is None or one.member.scene in new]
-    scores: dict[Pair, tuple[float, float]] = {}
+    scores: dict[tuple[str, str], tuple[float, float]] = {}
     for one, found in zip(queries, look_up(queries, [new_segment(scenes)], params), strict=True):
         for candidate in found[: params.top_k]:
             pair = directed(one.member.scene, candidate.scene)
