@@ -46,6 +46,20 @@ def moved_box(bounds: np.ndarray, S_a_b: Sim3) -> np.ndarray:
     return box_around(S_a_b.apply(box_corners(bounds)))
 
 
+def box_overlaps(a: np.ndarray, b: np.ndarray, pad: np.ndarray | float = 0.0) -> np.ndarray:
+    """Return the intersection over union (N, M) of boxes (N, 2, 3) and (M, 2, 3).
+
+    Args:
+        pad: enlarge the boxes of each pair by this on every side; a number, or (N, M, 1).
+    """
+    a, b = a[:, None], b[None]
+    low, high = np.maximum(a[:, :, 0], b[:, :, 0]) - pad, np.minimum(a[:, :, 1], b[:, :, 1]) + pad
+    both = np.clip(high - low, 0, None).prod(2)
+    volumes = [(box[:, :, 1] - box[:, :, 0] + 2 * pad).prod(2) for box in (a, b)]
+    found: np.ndarray = both / (volumes[0] + volumes[1] - both)
+    return found
+
+
 def robust_box(points: np.ndarray, weights: np.ndarray | None = None, outside: float = 0.01) -> np.ndarray:
     """Return the box (2, 3) between two quantiles of points (N, 3), N > 0, along each axis, which is robust to
     outliers.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Row, select
 
-from gsmap.geometry.boxes import moved_box
+from gsmap.geometry.boxes import box_overlaps, moved_box
 from gsmap.store.matrices import to_array, to_pose
 from gsmap.store.schema import change_reviews, changes, comparisons, scenes
 from gsmap.types import Sim3
@@ -37,7 +37,6 @@ class StoredChange:
         num_voxels, num_before, num_after: lengths of its arrays.
         status: review status: ``open``, ``confirmed`` or ``rejected``.
         comparison: number of the comparison, and ``place`` in it.
-        found_at: when it was compared.
     """
 
     number: int
@@ -55,7 +54,6 @@ class StoredChange:
     status: str
     comparison: int
     place: int
-    found_at: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,20 +143,16 @@ def match_changes(
             continue  # the dates were corrected, so that appeared and disappeared are swapped
         moved = moved_box(old.box, S_frame_newer @ pose.inverse())
         for i, (kind, box) in enumerate(found):
-            if kind == old.kind and (share := _overlap(moved, box)) >= _MIN_OVERLAP:
+            if (
+                kind == old.kind
+                and (share := float(box_overlaps(moved[None], box[None], _PAD_M)[0, 0])) >= _MIN_OVERLAP
+            ):
                 boxes.append((-share, number, i))
     same: dict[int, int] = {}
     for _, number, i in sorted(boxes):
         if i not in same and number not in same.values():
             same[i] = number
     return same
-
-
-def _overlap(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the intersection over union of two padded boxes."""
-    a, b = (np.array([box[0] - _PAD_M, box[1] + _PAD_M]) for box in (a, b))
-    both = float(np.prod(np.maximum(np.minimum(a[1], b[1]) - np.maximum(a[0], b[0]), 0.0)))
-    return both / (float(np.prod(a[1] - a[0])) + float(np.prod(b[1] - b[0])) - both)
 
 
 def latest_changes(connection: Connection, pair: str) -> list[tuple[int, StoredChange, Sim3]]:
@@ -240,5 +234,4 @@ def _stored(line: Row[Any], row: Row[Any], in_force: Mapping[int, str | None]) -
         status=_STATUS[in_force.get(number)],
         comparison=row.number,
         place=line.place,
-        found_at=row.created_at,
     )

@@ -17,6 +17,7 @@ import numpy as np
 from sqlalchemy import Connection, Row, delete, func, insert, select, update
 
 from gsmap.errors import InputError, NotFoundError
+from gsmap.geometry.boxes import box_overlaps
 from gsmap.methods import RecipeKey
 from gsmap.store import facts, recipes
 from gsmap.store.catalog import Catalog, now
@@ -402,14 +403,7 @@ def _overlaps(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     size = np.maximum(
         np.linalg.norm(a[:, 1] - a[:, 0], axis=1)[:, None], np.linalg.norm(b[:, 1] - b[:, 0], axis=1)[None]
     )
-    pad = np.maximum(_PAD * size, 1e-9)[..., None]
-    low = np.maximum(a[:, None, 0], b[None, :, 0]) - pad
-    high = np.minimum(a[:, None, 1], b[None, :, 1]) + pad
-    both = np.clip(high - low, 0, None).prod(2)
-    ours = (a[:, None, 1] - a[:, None, 0] + 2 * pad).prod(2)
-    theirs = (b[None, :, 1] - b[None, :, 0] + 2 * pad).prod(2)
-    found: np.ndarray = both / (ours + theirs - both)
-    return found
+    return box_overlaps(a, b, np.maximum(_PAD * size, 1e-9)[..., None])
 
 
 # --- facts -----------------------------------------------------------------------------------------------------------

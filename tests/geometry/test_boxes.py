@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsmap.geometry.boxes import are_finite, box_around, box_corners
+from gsmap.geometry.boxes import are_finite, box_around, box_corners, box_overlaps
 
 
 def test_corners_come_in_the_order_of_their_bits():
@@ -22,3 +22,11 @@ def test_points_are_finite_where_all_three_numbers_are():
     points = np.zeros((5, 3))
     points[1, 0], points[2, 1], points[3, 2] = np.nan, np.inf, -np.inf
     assert are_finite(points).tolist() == [True, False, False, False, True]
+
+
+def test_overlaps_are_shares_of_the_union_of_padded_boxes():
+    unit = np.array([[0.0, 0, 0], [1, 1, 1]])
+    boxes = np.array([unit, unit + np.array([0.5, 0, 0]), unit + 2])
+    np.testing.assert_allclose(box_overlaps(unit[None], boxes), [[1, 1 / 3, 0]])
+    wall = np.array([[[0.0, 0, 0], [1, 1, 0]]])
+    np.testing.assert_allclose(box_overlaps(wall, wall + np.array([0.5, 0, 0]), 0.25), [[1 / 2]])
