@@ -71,6 +71,50 @@ INLINE Symmetric mean_of(const Symmetric &s, const Symmetric &t, double more) {
             (s.yy + t.yy) * 0.5 + more, (s.yz + t.yz) * 0.5, (s.zz + t.zz) * 0.5 + more};
 }
 
+// Writes the lanes that a mask names one after the other, and anything up to a vector's end; returns how many.
+INLINE int append(M which, V squared, const int32_t *rows, float *to_squared, int32_t *to_rows) {
+    const uint32_t named = bits(which);
+#if GSMAP_AVX512
+    const __m512i row = _mm512_load_si512(rows);
+    _mm512_storeu_ps(to_squared, _mm512_maskz_compress_ps(which, (__m512)squared));
+    _mm512_storeu_si512(to_rows, _mm512_maskz_compress_epi32(which, row));
+#else
+    int count = 0;
+    for (uint32_t left = named; left; left &= left - 1, ++count) {
+        const int l = __builtin_ctz(left);
+        to_squared[count] = squared[l], to_rows[count] = rows[l];
+    }
+#endif
+    return __builtin_popcount(named);
+}
+
+// How many of some numbers, whole vectors of them, are no larger than a limit.
+INLINE int count_within(const float *values, int count, float limit) {
+    int within = 0;
+    for (int i = 0; i < count; i += W) within += __builtin_popcount(bits(ge(set1(limit), load(values + i))));
+    return within;
+}
+
+// A number with k of the others at it or below; negative where equal ones leave none, or none is found soon.
+INLINE float limit_of(const float *values, int count, int k) {
+    V most{};
+    for (int i = 0; i < count; i += W) most = max(most, zero_unless(first_lanes(count - i), load(values + i)));
+    float low = 0, high = max_of_lanes(most);
+    int below = count_within(values, count, 0.f), within = count;
+    for (int step = 0; within != k; ++step) {
+        if (step == 12 || below >= k) return -1;
+        const float share = step % 3 == 2 ? 0.5f : float(k - below) / float(within - below);  // as if they lay evenly
+        const float middle = low + share * (high - low);
+        if (!(middle > low && middle < high)) return -1;
+        const int found = count_within(values, count, middle);
+        if (found >= k)
+            high = middle, within = found;
+        else
+            low = middle, below = found;
+    }
+    return high;
+}
+
 // Leaves the k nearest of what was found for a point, of equally near ones those found first; farther ones count no more.
 INLINE void keep_nearest(gsmap::Search &search, int point, int k) {
     float *squared = search.squared[point];
@@ -78,6 +122,20 @@ INLINE void keep_nearest(gsmap::Search &search, int point, int k) {
     const int count = search.count[point];
     if (count < k) return;
     for (int i = count; i % W; ++i) squared[i] = __builtin_inff();
+    int kept = 0;
+    const float limit = limit_of(squared, count, k);
+    if (limit >= 0) {
+        V most{};
+        for (int i = 0; i < count; i += W) {
+            const V d = load(squared + i);
+            const M stays = ge(set1(limit), d);
+            most = max(most, zero_unless(stays, d));
+            kept += append(stays, d, row + i, squared + kept, row + kept);
+        }
+        search.count[point] = kept;
+        search.bound[point] = max_of_lanes(most);
+        return;
+    }
     int8_t nearer[gsmap::Search::kRoom];
     for (int i = 0; i < count; ++i) {
         int before = 0;
@@ -85,7 +143,6 @@ INLINE void keep_nearest(gsmap::Search &search, int point, int k) {
             before += __builtin_popcount(bits(gt(set1(squared[i]), load(squared + first))));
         nearer[i] = int8_t(before);
     }
-    int kept = 0;
     float bound = 0;
     for (int i = 0; i < count; ++i) {
         const bool stays = (nearer[i] < k) & (kept < k);
@@ -113,17 +170,12 @@ float find_nearest(const gsmap::Leaf &of, const gsmap::Leaf &among, int k, gsmap
             const int point = part + __builtin_ctz(near);
             if (point >= of.count) break;
             int count = search.count[point];
-            alignas(64) float squared[gsmap::kLeaf];
             for (int first = 0; first < gsmap::kLeaf; first += W) {
                 const V x = load(among.at[0] + first) - of.at[0][point], y = load(among.at[1] + first) - of.at[1][point],
                         z = load(among.at[2] + first) - of.at[2][point];
                 const V d = x * x + y * y + z * z;
-                store(squared + first, d);
-                for (uint32_t there = bits(ge(set1(search.bound[point]), d)); there; there &= there - 1) {
-                    const int i = first + __builtin_ctz(there);
-                    search.squared[point][count] = squared[i];
-                    search.row[point][count++] = among.row[i];
-                }
+                count += append(ge(set1(search.bound[point]), d), d, among.row + first, search.squared[point] + count,
+                                search.row[point] + count);
             }
             search.count[point] = count;
             if (count > 2 * k) keep_nearest(search, point, k);
