@@ -4,9 +4,9 @@
     python -m tools.bench.real_size --data FOLDER --cache FOLDER
 
 Without ``--data`` the pair is made from the captures c0 and c1 of the house (see ``--house``), which are separate
-trainings of 150 thousand Gaussians each: every Gaussian becomes several smaller ones, drawn from its own distribution,
-so that surfaces have the density of real captures; higher SH coefficients are noise, and cameras are repeated with
-small random motions. The photo is one of the frames that c0 was trained on. ``--data`` reads a folder with two
+trainings of 150 thousand Gaussians each: every Gaussian becomes several smaller ones that together look like it, so
+that surfaces have the density of real captures; higher SH coefficients are noise, and cameras are repeated with small
+random motions. The photo is one of the frames that c0 was trained on. ``--data`` reads a folder with two
 captures NAME.ply, NAME.cameras.json and, optionally, truth/NAME.json (``T_scene_world``) and one photo.jpg.
 
 One line for each step: CPU seconds (user and system, one thread) and peak memory, each step in a process of its own,
@@ -46,23 +46,31 @@ from gsmap.types import Cameras, Gaussians, Sim3
 
 STEPS = ("ingest", "describe", "pair", "pair again", "changes", "features", "photo", "tto tile", "tiles with levels")
 _NUM_CAMERAS = 300
-_SH_REST_SIGMA = 0.03
+_OVERLAP = 4.0
+_SH_REST_SIGMA = 0.01
 _CAMERA_SIGMAS = 0.05, 0.05  # metres, radians
 _FOCAL_PX = 280.0  # of the frames of the house
 _TILE_M, _TILE_STEPS = 6.0, 150  # edge and optimization steps of the tile of the step "tto tile"
 
 
 def densified(gaussians: Gaussians, count: int, seed: int) -> Gaussians:
-    """Replace every Gaussian by several smaller ones of SH degree 3, drawn from its own distribution."""
+    """Replace every Gaussian by several smaller ones of SH degree 3 on its surface, which together look like it.
+
+    At each point of its surface `_OVERLAP` of them overlap on average, and share its optical depth. With fewer, or with
+    its own opacity, renders are speckled and let surfaces behind shine through, and no photo looks like them.
+    """
     rng = np.random.default_rng(seed)
     rows = np.linspace(0, len(gaussians), count, endpoint=False).astype(np.int64)
     g, times = gaussians[rows], count / len(gaussians)
-    step = rng.normal(size=(count, 3)).astype(np.float32) * g.scales
-    means = g.means + np.einsum("nij,nj->ni", quats_to_matrices(g.quats), step).astype(np.float32)
-    thinner = g.log_scales - np.float32(0.5 * np.log(times)) * (g.log_scales > g.log_scales.min(1, keepdims=True))
-    sh = rng.normal(0, _SH_REST_SIGMA, (count, 16, 3)).astype(np.float32)
-    sh[:, 0] = g.sh[:, 0]
-    return Gaussians(means, g.quats, thinner, g.logit_opacities, sh)
+    overlap = min(_OVERLAP, times)
+    along = g.log_scales > g.log_scales.min(1, keepdims=True)
+    step = np.sqrt(1 - overlap / times) * rng.normal(size=(count, 3)) * g.scales * along
+    means = g.means + np.einsum("nij,nj->ni", quats_to_matrices(g.quats), step)
+    smaller = g.log_scales + 0.5 * np.log(overlap / times) * along
+    depth = np.logaddexp(0, g.logit_opacities.clip(max=15).astype(np.float64)) / overlap  # -log(1 - opacity)
+    sh = rng.normal(0, _SH_REST_SIGMA, (count, 16, 3))
+    sh[:, : g.sh.shape[1]] = g.sh
+    return Gaussians(means, g.quats, smaller, np.log(np.expm1(depth)), sh)
 
 
 def repeated(cameras: Cameras, count: int, seed: int) -> Cameras:
