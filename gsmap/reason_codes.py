@@ -46,6 +46,7 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
     ),
     # Of pairs, photos and scans.
     "ambiguous": ("Another pose or place fits about as well.", r"ambiguous: |it fits two places"),
+    "look_alike": ("Two places that look alike, or one that was refurnished.", r"two places that look alike"),
     "not_probable": ("The pose is not probable enough given all evidence.", r"not probable enough"),
     "pose_uncertain": (
         "The pose is too uncertain.",

@@ -139,6 +139,7 @@ def _evidence(pair: PairReport, bars: verdict.Params, max_disagreement: float) -
         held("colour correlation", "colour_correlation", bars.min_colour_correlation, at_least=True),
         ExplanationStep(name="colour significance", value=known("colour_t")),
         free_space,
+        held("look-alike", "look_alike", round(1 - bars.min_probability, 6), note=" that these are two places"),
         held("probability", "probability", bars.min_probability, at_least=True, note=", of all of these"),
         held(
             "disagreement",
@@ -173,6 +174,6 @@ def _advice(pair: PairReport, steps: Mapping[str, ExplanationStep], untried: str
         )
     if "coinciding cells" in failed or pair.status == "no_match":
         return f"add a capture of the way from {a} to {b} that shares about a third with each"
-    if "free-space violation" in failed or in_doubt:
+    if failed & {"free-space violation", "look-alike"} or in_doubt:
         return f"either two places look alike, or one place changed a lot; if you know that it is one place: {confirm}"
     return f"add a capture that shows more of what {a} and {b} share, from both sides"

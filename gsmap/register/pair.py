@@ -127,8 +127,8 @@ def _compare_elsewhere(
     """Compare the most probable pose with all poses elsewhere under which both surfaces are about as similar.
 
     Returns:
-        All evaluated poses, the most similar poses elsewhere among them, with their similarities if there are any; and
-        the similarities of the other poses elsewhere, which are too many to evaluate.
+        All evaluated poses, the most similar poses elsewhere among them, with their similarities; and the similarities
+        of the other poses elsewhere, which are too many to evaluate.
     """
     best = max((j for j in evaluated if not contradiction_of(j, params)), key=odds_of, default=None)
     if best is None or odds_of(best) < _MIN_ODDS:
@@ -151,8 +151,6 @@ def _compare_elsewhere(
     # In a place that repeats, correspondences favour no period: each counts as much as the most probable pose.
     proposals = [replace(best.proposal, S_target_source=S, support=None) for S, _ in left[: params.max_poses]]
     evaluated = [*evaluated, *(_evaluate(proposal, target, source, params, watch) for proposal in proposals)]
-    if len(evaluated) == 1:
-        return evaluated, []
     with watch.step("verdict"):
         poses = [pair.to_metres(j.proposal.S_target_source) for j in evaluated]
         compared = [replace(j, similarity=repetition.similarity(S)) for j, S in zip(evaluated, poses, strict=True)]

@@ -12,6 +12,7 @@ from gsmap.geometry.rotations import angle_between
 from gsmap.reason_codes import reason, reason_code
 from gsmap.register import verdict
 from gsmap.register.evidence import PoseEvidence
+from gsmap.register.look_alike import look_alike_probability
 from gsmap.register.metric_scene import own_working_m
 from gsmap.register.params import Params
 from gsmap.register.probability import probability
@@ -44,8 +45,7 @@ class EvaluatedPose:
         flaw: reason why the pose is not accepted; empty if it is.
         decision: decision on the scale; None if it was not measured, or if the unit of a scene is unknown.
         strain: change of shape that would align the source; None if a similarity aligns it.
-        similarity: similarity of both surfaces under the pose (`gsmap.register.repetition`); NaN if it is not known or
-            no other pose is possible.
+        similarity: similarity of both surfaces under the pose (`gsmap.register.repetition`); NaN if it is not known.
     """
 
     proposal: Proposal
@@ -89,7 +89,8 @@ def select_pose(
     least = max(best.similarity - MARGIN, MARGIN)
     num_as_similar = len(as_similar) + sum(not similarity < least for similarity in elsewhere)
     others = [j for j in others if j not in as_similar]
-    probable = _probability_among(best, others, num_as_similar)
+    alike = look_alike_probability(best.evidence, best.similarity)
+    probable = _probability_among(best, others, num_as_similar) * (1.0 - float(np.nan_to_num(alike)))
     rivals = as_similar or [j for j in others if verdict.is_acceptable(j.proposal, j.evidence, params.verdict)]
     if probable < params.verdict.min_probability:
         rivals = rivals or sorted(others, key=lambda j: -odds_of(j))
@@ -100,6 +101,11 @@ def select_pose(
         else:
             told = f"the surfaces are as similar under {counted(num_as_similar, 'other pose')}, and this one"
         why = reason("ambiguous", f"ambiguous: {told} is correct with a probability of {probable:.0%}")
+    elif accepted and alike > 1.0 - params.verdict.min_probability:
+        status = "rejected"
+        why = reason(
+            "look_alike", f"two places that look alike, or one that was refurnished: {alike:.0%} for the former"
+        )
     elif not accepted and not verdict.has_low_nfa(best.proposal, params.verdict):
         status, why = "no_match", verdict.not_significant(best.proposal, params.verdict, best.flaw)
     information = None
@@ -120,7 +126,7 @@ def select_pose(
         overlap=best.evidence.overlap,
         proposer=best.proposal.proposer,
         exact=best.proposal.exact,
-        evidence=_evidence_figures(best, probable),
+        evidence=_evidence_figures(best, probable, alike),
         notes=tuple(notes),
         **common,
     )
@@ -204,7 +210,7 @@ def _probability_among(best: EvaluatedPose, others: Sequence[EvaluatedPose], num
     return odds / (1.0 + (1 + num_equal) * odds + sum(odds_of(j) for j in others))
 
 
-def _evidence_figures(evaluated: EvaluatedPose, probable: float) -> dict[str, float]:
+def _evidence_figures(evaluated: EvaluatedPose, probable: float, alike: float) -> dict[str, float]:
     """Return the evidence as stored with the registration; see `gsmap.types.Registration`."""
     p, e = evaluated.proposal, evaluated.evidence
     log_scale = log_scale_sigma = float("nan")
@@ -222,6 +228,8 @@ def _evidence_figures(evaluated: EvaluatedPose, probable: float) -> dict[str, fl
         "colour_correlation": e.colour_correlation,
         "colour_t": e.colour_t,
         "probability": probable if e.num_coinciding else float("nan"),
+        "similarity": evaluated.similarity,
+        "look_alike": alike,
         "disagreement": e.disagreement,
         "seen_m2": e.seen_m2,
         "log_scale": log_scale,

@@ -116,6 +116,10 @@ class Registration(RegisteredPose):
             ``colour_t``: its significance, in standard deviations over patches.
             ``probability``: that the pose is right, and not another that was judged, of all evidence together, as far
             as captures of made places tell (`gsmap.register.probability`); NaN where nothing was measured.
+            ``similarity``: Fisher's transform of the correlation of the colours of both surfaces, cell by cell; NaN
+            where they have too little in common.
+            ``look_alike``: the probability that the pair shows two places that look alike, as ``probability`` takes
+            into account; NaN where nothing tells.
             ``disagreement``: of the surface that both saw, as area, the share that is not the same in both: one looked
             through it, or shows another pattern on it; NaN without cameras.
             ``seen_m2``: that surface, in square metres.

@@ -336,7 +336,8 @@ def test_a_rival_that_is_known_too_loosely_to_be_an_edge_is_a_rival():
         found = select_pose(world.target, world.source, [best, rival], Params(), seconds={})
         return found.status, found.evidence["probability"]
 
-    alone = select_pose(world.target, world.source, [best], Params(), seconds={}).evidence["probability"]
+    found = select_pose(world.target, world.source, [best], Params(), seconds={}).evidence
+    alone, one_place = found["probability"], 1 - found["look_alike"]
     loose = replace(best, proposal=moved, flaw="the overlap determines the pose only to 8 cm")
     assert status(loose) == ("no_match", pytest.approx(0.5, abs=0.01))
     near = replace(loose, proposal=_nearly(best.proposal))
@@ -345,9 +346,9 @@ def test_a_rival_that_is_known_too_loosely_to_be_an_edge_is_a_rival():
     assert status(contradicted) == ("accepted", pytest.approx(alone))
     # At most one of both is right: odds of each against neither and against the other.
     weaker = replace(loose, evidence=replace(evidence, colour_correlation=0.16, overlap=0.05), flaw="not probable")
-    odds = [p / (1 - p) for p in (alone, probability(moved, weaker.evidence, verdict.PRIOR))]
+    odds = [p / (1 - p) for p in (alone / one_place, probability(moved, weaker.evidence, verdict.PRIOR))]
     assert odds[1] > 0.2
-    assert status(weaker)[1] == pytest.approx(odds[0] / (1 + sum(odds)))
+    assert status(weaker)[1] == pytest.approx(one_place * odds[0] / (1 + sum(odds)))
 
 
 def _nearly(proposal: Proposal) -> Proposal:

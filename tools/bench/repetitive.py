@@ -6,8 +6,10 @@ Façades, corridors, colonnades, parking decks, rooms that look alike from sever
 other furniture (`gsmap_synthetic`): five captures of each seed, with the faults that captures have, and all pairs of
 them. In one of three places nothing is unique, in the others some bays or most have things of their own. Truth is
 exact. A pose is wrong if it puts the source's middle more than 0.3 m or 3 degrees off; it is over 5 sigma off if one of
-the axes of its covariance is. Two flats of one make are different places: every pose between them is wrong. "Used" are
-edges that are neither refused nor tentative in the map of the five captures. Seeds from 200 on had no part in any fit.
+the axes of its covariance is. Two flats of one make are different places: every pose between them is wrong. Of changed
+flats two captures show what is left after 30 and 60 % of the furniture changed, and one shows another flat of the make.
+"Used" are edges that are neither refused nor tentative in the map of the five captures. Seeds from 200 on had no part
+in any fit.
 """
 
 # Thread counts must be set before numpy comes in.
@@ -34,14 +36,19 @@ from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.similarities import Similarities
 from gsmap.types import Sim3
 from gsmap_synthetic import make_captures
+from gsmap_synthetic.edits import edit_place
 from gsmap_synthetic.facade import front_captures, make_front
 from gsmap_synthetic.halls import Kind, hall_captures, make_hall
 from gsmap_synthetic.make import DemoCapture
+from gsmap_synthetic.script import random_edits
 from gsmap_synthetic.streets import make_street
 from tools.bench.front import worse
 
-KINDS = (*get_args(Kind), "facade", "twin flats")
+KINDS = (*get_args(Kind), "facade", "twin flats", "changed flats")
 _ROUTES = ((0, 1), (1, 2), (3, 4), (4, 5), (2, 3))  # rooms 3 to 5 are decorated as rooms 0 to 2 are
+_CHANGED_SHARES = 0.3, 0.6  # of the furniture of rooms 0 and 1
+_TOLD = "probability", "log_nfa", "look_alike", "similarity"
+_FLAT: dict[str, Any] = {"steps": 0, "num_gaussians": 20_000, "num_frames": 48}
 WRONG_M, WRONG_DEG, SIGMAS = 0.3, 3.0, 5.0
 
 
@@ -83,7 +90,15 @@ def captures_of(kind: str, seed: int) -> tuple[list[DemoCapture], float]:
     unique = (0.0, 0.3, 1.0)[seed % 3]
     if kind == "twin flats":
         place = make_street(seed, rooms=6, decorations=3, texel_m=0.02)
-        made = make_captures(seed, 5, steps=0, num_gaussians=20_000, num_frames=48, place=place, routes=_ROUTES)
+        made = make_captures(seed, 5, place=place, routes=_ROUTES, **_FLAT)
+        unique = 1.0
+    elif kind == "changed flats":
+        place = make_street(seed, rooms=6, decorations=3, texel_m=0.02)
+        made = make_captures(seed, 3, place=place, routes=_ROUTES[:3], **_FLAT)
+        for k, share in enumerate(_CHANGED_SHARES, start=3):
+            edits = random_edits(place, np.random.default_rng([seed, k, 72]), rooms=_ROUTES[0], share=share)
+            changed = edit_place(place, edits, texel_m=0.02)
+            made += make_captures(seed, 1, place=changed, routes=_ROUTES[:1], first=k, **_FLAT)
         unique = 1.0
     elif kind == "facade":
         starts = [k * 10.0 + float(rng.uniform(-1, 1)) * (k > 0) for k in range(5)]
@@ -124,7 +139,13 @@ def registered_pairs(folder: Path, kind: str, seed: int) -> list[dict[str, Any]]
             a, b = scenes[r.target].name, scenes[r.source].name
             row: dict[str, Any] = {"place": folder.name, "unique": stored["unique"] > 0, "pair": f"{a}:{b}"}
             row |= {"overlap": overlaps[frozenset((a, b))], "accepted": r.status == "accepted", "reason": r.reason}
-            row |= {"p": r.evidence.get("probability"), "nfa": r.evidence.get("log_nfa"), "m": np.nan, "deg": np.nan}
+            row |= {
+                "evidence": r.evidence,
+                "p": r.evidence.get("probability"),
+                "nfa": r.evidence.get("log_nfa"),
+                "m": np.nan,
+                "deg": np.nan,
+            }
             row["used"] = used.get(frozenset((r.target, r.source)), False)
             if r.S_target_source is not None:
                 true = truth[a] @ truth[b].inverse()
@@ -159,7 +180,8 @@ def tell(pairs: Sequence[dict[str, Any]]) -> None:
             error = f"{row['m']:.3f} m {row['deg']:.2f} deg {row.get('sigmas', np.nan):.1f} sigma"
             print(
                 f"{row['place']} {row['pair']} overlap {row['overlap']:.2f}: {answer}, used {row['used']}, {error}, "
-                f"probability {row['p']}, log10 NFA {row['nfa']}, {row['reason']}",
+                + ", ".join(f"{name} {row['evidence'].get(name, np.nan):.3g}" for name in _TOLD)
+                + f", {row['reason']}",
                 flush=True,
             )
 
