@@ -46,7 +46,7 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
     ),
     # Of pairs, photos and scans.
     "ambiguous": ("Another pose or place fits about as well.", r"ambiguous: |it fits two places"),
-    "look_alike": ("Two places that look alike, or one that was refurnished.", r"two places that look alike"),
+    "look_alike": ("Two places that look alike, or one that was refurnished.", r"two places that look alike \("),
     "not_probable": ("The pose is not probable enough given all evidence.", r"not probable enough"),
     "pose_uncertain": (
         "The pose is too uncertain.",
@@ -82,7 +82,10 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
     ),
     "contradicts_edges": ("The edge contradicts the other edges.", r"contradicts the other edges"),
     "outvoted": ("Too few edges agree against those that contradict them.", r"\d+ edges agree and \d+ others"),
-    "surfaces_differ": ("Both scenes saw different surfaces at the place.", r"\S+% of what both saw is not the same"),
+    "surfaces_differ": (
+        "Both scenes saw different surfaces at the place.",
+        r"the captures show two places that look alike|\S+% of what both saw is not the same",
+    ),
     "too_few_edges": ("Too few agreeing edges join two large components.", r"would join two (components|islands)"),
     "unconfirmed": (
         "No cycle of edges confirms the edge.",

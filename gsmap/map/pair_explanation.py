@@ -84,11 +84,11 @@ def _retrieval(store: Store, settings: Settings, a: Scene, b: Scene) -> tuple[st
 
 def _held(store: Store, settings: Settings) -> list[tuple[str, str]]:
     """Return the pairs that have a usable edge without doubt."""
-    bar = settings.optimize.max_disagreement
+    bar = settings.optimize.max_look_alike
     return [
         (one.target, one.source)
         for one in store.registrations.all_summaries()
-        if one.usable and (one.is_specified or not one.disagreement > bar)
+        if one.usable and (one.is_specified or not one.look_alike > bar)
     ]
 
 
@@ -97,7 +97,7 @@ def _steps(pair: PairReport, settings: Settings) -> list[ExplanationStep]:
         return []
     steps = []
     if pair.proposer:
-        steps += _evidence(pair, settings.register.verdict, settings.optimize.max_disagreement)
+        steps += _evidence(pair, settings.register.verdict, settings.optimize.max_look_alike)
     steps.append(ExplanationStep(name="verdict", value=pair.status, bar="accepted", passed=pair.status == "accepted"))
     if pair.review:
         steps.append(ExplanationStep(name="review", value=pair.review))
@@ -109,7 +109,7 @@ def _steps(pair: PairReport, settings: Settings) -> list[ExplanationStep]:
     return steps
 
 
-def _evidence(pair: PairReport, bars: verdict.Params, max_disagreement: float) -> list[ExplanationStep]:
+def _evidence(pair: PairReport, bars: verdict.Params, max_look_alike: float) -> list[ExplanationStep]:
     """Return the evidence for the pose, each item with its threshold."""
     figures: Mapping[str, Any] = pair.evidence
 
@@ -139,14 +139,9 @@ def _evidence(pair: PairReport, bars: verdict.Params, max_disagreement: float) -
         held("colour correlation", "colour_correlation", bars.min_colour_correlation, at_least=True),
         ExplanationStep(name="colour significance", value=known("colour_t")),
         free_space,
-        held("look-alike", "look_alike", round(1 - bars.min_probability, 6), note=" that these are two places"),
         held("probability", "probability", bars.min_probability, at_least=True, note=", of all of these"),
-        held(
-            "disagreement",
-            "disagreement",
-            max_disagreement,
-            note=" of the surface that both saw, or the edge is doubtful",
-        ),
+        ExplanationStep(name="disagreement", value=known("disagreement")),
+        held("look-alike", "look_alike", max_look_alike, note=" that these are two places, or the edge is doubtful"),
     ]
 
 
@@ -160,7 +155,7 @@ def _advice(pair: PairReport, steps: Mapping[str, ExplanationStep], untried: str
         return ""
     if pair.status == "never registered":
         return f"{untried}; to try it all the same: gsmap register {at} --pairs {pair.pair}"
-    in_doubt = "disagreement" in failed
+    in_doubt = "look-alike" in failed
     if in_doubt and pair.status == "accepted":
         return (
             "either the place changed, or two places look alike; to decide, add a capture that walks from what "
@@ -174,6 +169,6 @@ def _advice(pair: PairReport, steps: Mapping[str, ExplanationStep], untried: str
         )
     if "coinciding cells" in failed or pair.status == "no_match":
         return f"add a capture of the way from {a} to {b} that shares about a third with each"
-    if failed & {"free-space violation", "look-alike"} or in_doubt:
+    if "free-space violation" in failed or in_doubt:
         return f"either two places look alike, or one place changed a lot; if you know that it is one place: {confirm}"
     return f"add a capture that shows more of what {a} and {b} share, from both sides"

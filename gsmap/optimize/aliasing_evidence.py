@@ -1,18 +1,16 @@
-"""Judge doubtful edges, whose captures disagree on a surface that both saw: the place changed, or these are two similar
-places.
+"""Judge doubtful edges, whose captures may show two places that look alike: so does a place that changed much.
 
 The pair alone does not decide between both; the map does. If the remaining edges support a doubtful edge, the place
 changed; if they contradict it, there are two places. A doubtful edge that alone connects two parts of the map is
 accepted, with tentative scenes, if most doubtful edges of this map turned out to be correct; otherwise the parts stay
 separate.
 
-Assumption: if a place is captured twice without change, nearly all of the common surface agrees. It fails for rooms
-that are repeated entirely, including their furniture; `gsmap.optimize.perceptual_aliasing` handles them.
+The probability of two places (`gsmap.register.look_alike`) is low for rooms that are repeated entirely, including
+their furniture; `gsmap.optimize.perceptual_aliasing` handles them.
 
-The threshold of doubt depends on the map: noisy captures disagree more, and bare rooms less. So where edges contradict
-each other, edges are accepted in order of likelihood, and the first contradicted edges set the threshold. The
-likelihood uses all evidence of registration (`gsmap.optimize.edge_likelihood`), because a repeated facade disagrees
-less than two captures that see one place from afar. Edges of unknown likelihood are ranked by disagreement.
+The threshold of doubt depends on the map: noisy captures agree less. So where edges contradict each other, edges are
+accepted in order of likelihood, and the first contradicted edges set the threshold. The likelihood uses all evidence of
+registration (`gsmap.optimize.edge_likelihood`). Edges of unknown likelihood are ranked by disagreement.
 """
 
 from __future__ import annotations
@@ -33,32 +31,32 @@ from gsmap.reason_codes import reason
 
 _MAX_ALIASING_PROBABILITY = 0.5  # doubtful edges join no components if the aliasing probability of this map is higher
 _COST = 10.0  # accepting a wrong edge costs as much as doubting this many correct edges
-_LEAST_SPREAD = 0.15  # lower bound of the spread of log disagreements, for small samples
+_LEAST_SPREAD = 0.15  # lower bound of the spread of log probabilities, for small samples
 _SCENE_STEPS, _FEWEST_STEPS = 2000, 8  # large maps accept more edges per step, because each step costs a solve
 _STEPS = 64  # maximum number of steps in which edges are accepted by likelihood
 
 
 def find_doubtful(m: Measurements, bar: float) -> np.ndarray:
-    """Return an (E,) mask that is True for doubtful edges: at least the fraction ``bar`` of the common surface
-    disagrees, and no person confirmed the edge."""
-    with np.errstate(invalid="ignore"):  # NaN: not compared, hence not doubtful
-        found: np.ndarray = (m.disagreement >= bar) & ~m.confirmed
+    """Return an (E,) mask that is True for doubtful edges: the probability of two places is ``bar`` or more, and
+    no person confirmed the edge."""
+    with np.errstate(invalid="ignore"):  # NaN: unknown, hence not doubtful
+        found: np.ndarray = (m.look_alike >= bar) & ~m.confirmed
     return found
 
 
 def find_doubtful_in_map(
     m: Measurements, state: State, doubtful: np.ndarray, gate: float, params: Params
 ) -> np.ndarray:
-    """Return an (E,) mask of doubtful edges, judged by ``max_disagreement`` and by the contradictions of this map.
+    """Return an (E,) mask of doubtful edges, judged by ``max_look_alike`` and by the contradictions of this map.
 
     Where the map contradicts more doubtful edges than it supports, it has places that look alike; then the threshold
-    best separates the disagreements of accepted edges from those of contradicted edges. Where undoubted edges
+    best separates the probabilities of accepted edges from those of contradicted edges. Where undoubted edges
     contradict each other, the edges from `find_first_contradicted` are doubtful as well.
 
     Args:
         state: state of the map computed from undoubted edges alone.
     """
-    bar = params.max_disagreement
+    bar = params.max_look_alike
     inside = _within(m, state.accepted)
     fits = np.zeros(len(m), dtype=bool)
     rows = np.flatnonzero(inside & doubtful)
@@ -66,9 +64,9 @@ def find_doubtful_in_map(
         fits[rows] = consistent_with_component(m, rows, state.drift(m), params.gate_probability)
     contradicted = inside & doubtful & ~fits
     aliasing = aliasing_probability(int((inside & doubtful & fits).sum()), int(contradicted.sum()))
-    accepted = state.accepted & (m.disagreement > 0)
+    accepted = state.accepted & (m.look_alike > 0)
     if aliasing > _MAX_ALIASING_PROBABILITY and accepted.any():
-        bar = min(bar, separating_threshold(m.disagreement[accepted], m.disagreement[contradicted]))
+        bar = min(bar, separating_threshold(m.look_alike[accepted], m.look_alike[contradicted]))
     found = find_doubtful(m, bar)
     if not (state.accepted | state.ambiguous | doubtful).all():
         found |= find_first_contradicted(m, ~(state.ambiguous | doubtful), state.terms, gate, params)
@@ -76,7 +74,7 @@ def find_doubtful_in_map(
 
 
 def separating_threshold(accepted: np.ndarray, contradicted: np.ndarray) -> float:
-    """Compute the threshold that best separates two log-normal sets of disagreements; infinity if they cannot be
+    """Compute the threshold that best separates two log-normal sets of probabilities; infinity if they cannot be
     separated. The decision is Bayesian: accepting a wrong edge costs `_COST` times as much as doubting a correct edge.
     """
     logs = [np.log(np.maximum(values, 1e-6)) for values in (accepted, contradicted)]

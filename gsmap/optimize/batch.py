@@ -79,9 +79,9 @@ def solve_batch(
 
 def _robust(m: Measurements, terms: PriorTerms, gate: float, params: Params) -> tuple[State, CycleSupport]:
     """Solve robustly for the poses and the accepted edges, doubtful edges included."""
-    doubtful = find_doubtful(m, params.max_disagreement)
+    doubtful = find_doubtful(m, params.max_look_alike)
     state, cycles = _grown_from(m, ~doubtful, terms, gate, params)
-    if (m.disagreement > 0).any() and not state.accepted.all():
+    if (m.look_alike > 0).any() and not state.accepted.all():
         stricter = find_doubtful_in_map(m, state, doubtful, gate, params)
         if (stricter & ~doubtful).any():
             doubtful = stricter

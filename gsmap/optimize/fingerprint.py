@@ -38,4 +38,5 @@ def fingerprint(edges: Sequence[Edge], priors: Sequence[Prior] = (), survey: Sur
 def _named(edge: Edge) -> str:
     """Return the part of an edge's hashed text that is not numbers."""
     same = "duplicate" * edge.duplicate
-    return f"{edge.target}\0{edge.source}\0{edge.disagreement!r}{edge.same_visit!r}{edge.log_odds_wrong!r}{same}"
+    likeness = f"{edge.disagreement!r}{edge.look_alike!r}{edge.same_visit!r}{edge.log_odds_wrong!r}"
+    return f"{edge.target}\0{edge.source}\0{likeness}{same}"

@@ -132,7 +132,7 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
     poses = Similarities.stack([previous.poses[s].S_map_scene for s in near] + [Sim3.identity()])
     accepted = np.r_[np.ones(len(around), dtype=bool), m.confirmed[len(around) :]]
     own_edges = m[np.arange(len(around), len(m))]
-    if own_edges.confirmed.any() or m.duplicate.any() or find_doubtful(own_edges, params.max_disagreement).any():
+    if own_edges.confirmed.any() or m.duplicate.any() or find_doubtful(own_edges, params.max_look_alike).any():
         return None
     before = component_labels(m, np.flatnonzero(accepted))
     nothing = np.zeros(len(m), dtype=np.int64)

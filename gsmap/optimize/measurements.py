@@ -25,6 +25,7 @@ class Measurements:
         information: (E, D, D) information matrices; D is 6 if every edge is rigid, otherwise 7.
         confirmed: (E,) mask of edges that a person confirmed.
         disagreement: (E,) share of the surface seen in both captures that differs; NaN if unknown.
+        look_alike: (E,) probability that both captures show two places that look alike; NaN if unknown.
         same_visit: (E,) mask of edges whose captures are of one visit, so that nothing changed between them.
         log_odds_wrong: (E,) log-odds by the evidence that the edge is wrong, up to a constant; NaN if unknown.
         duplicate: (E,) mask of edges between two scenes made from one capture.
@@ -37,6 +38,7 @@ class Measurements:
     information: np.ndarray
     confirmed: np.ndarray
     disagreement: np.ndarray
+    look_alike: np.ndarray
     same_visit: np.ndarray
     log_odds_wrong: np.ndarray
     duplicate: np.ndarray
@@ -73,6 +75,7 @@ class Measurements:
             self.information[rows],
             self.confirmed[rows],
             self.disagreement[rows],
+            self.look_alike[rows],
             self.same_visit[rows],
             self.log_odds_wrong[rows],
             self.duplicate[rows],
@@ -129,6 +132,7 @@ def measurements(scene_ids: Sequence[str], edges: Sequence[Edge], *, rigid: bool
         np.ascontiguousarray(information),
         np.array([e.confirmed for e in edges], dtype=bool),
         np.array([e.disagreement for e in edges], dtype=np.float64),
+        np.array([e.look_alike for e in edges], dtype=np.float64),
         np.array([e.same_visit for e in edges], dtype=bool),
         np.array([e.log_odds_wrong for e in edges], dtype=np.float64),
         np.array([e.duplicate for e in edges], dtype=bool),

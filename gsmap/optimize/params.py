@@ -30,11 +30,11 @@ class Params:
         min_wrong_probability: Smallest probability in (0, 1) of being wrong at which an edge, or a set of edges, of a
             contradictory loop is rejected; if no edge reaches it, all suspects stay undecided, so larger leaves more
             edges undecided.
-        max_disagreement: Fraction in (0, 1) of the surface seen by both captures of an edge; if the captures disagree
-            on more of it, the edge is doubtful. Larger trusts edges between places that look alike: an unchanged place
-            with a door shut between the captures reaches 0.064, and different places that look alike begin at 0.145.
+        max_look_alike: Probability in (0, 1) that both captures of an edge show two places that look alike, above which
+            the edge is doubtful. Larger trusts more edges between places that look alike, and more edges between
+            captures of a place that changed much.
         same_visit_h: Longest time in hours, at least 0, between two captures of one visit, during which nothing is
-            expected to change; larger refuses more edges between captures that disagree.
+            expected to change; larger refuses more doubtful edges.
         max_tilt_deg: Largest tilt in degrees, at least 0, that a component may keep after the solve; a component with
             more tilt is turned upright, so larger turns fewer components.
         max_unchanged_sigmas: Largest motion of a scene, in standard deviations of its pose, at least 0, at which the
@@ -50,13 +50,13 @@ class Params:
     min_large_component: int = 3
     min_bridge_edges: int = 3
     min_wrong_probability: float = 0.9
-    max_disagreement: float = 0.1
+    max_look_alike: float = 0.01
     same_visit_h: float = 6.0
     max_tilt_deg: float = 5.0
     max_unchanged_sigmas: float = 1e-3
 
     def __post_init__(self) -> None:
-        require_range(self, "(0, 1)", "gate_probability", "min_wrong_probability", "max_disagreement")
+        require_range(self, "(0, 1)", "gate_probability", "min_wrong_probability", "max_look_alike")
         require_range(self, "[0, inf]", "max_growth", "max_full_scenes", "max_marginal_scenes")
         require_range(self, "[0, inf]", "same_visit_h", "max_tilt_deg", "max_unchanged_sigmas")
         require_range(self, "[1, inf]", "min_large_component", "min_bridge_edges")

@@ -9,8 +9,8 @@ from gsmap.optimize.params import Params
 from gsmap.types.plain import plain
 
 VERSIONS = {
-    "optimize": 6,
-    "optimize.incremental": 6,
+    "optimize": 7,
+    "optimize.incremental": 7,
     "perceptual_aliasing": 1,
     "gravity_align": 1,
     "keep_unchanged_poses": 1,

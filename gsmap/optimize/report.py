@@ -77,7 +77,7 @@ def _outcomes(
         if firm[k]:
             out[key] = EdgeOutcome("used", residual)
         elif state.accepted[k] and state.doubtful[k]:
-            why = reason("surfaces_differ", f"{_disagreement_text(m, k)}: the place changed, or these are two places")
+            why = reason("surfaces_differ", f"{_look_alike_text(m, k)}, or one that changed")
             out[key] = EdgeOutcome("tentative", residual, why)
         elif state.accepted[k]:
             why = _REPEATED if repeated[k] else reason("unconfirmed", "in no agreeing cycle: no other edge confirms it")
@@ -89,7 +89,7 @@ def _outcomes(
             if repeated[k]:
                 why = _REPEATED
             if state.doubtful[k]:
-                why = reason("surfaces_differ", f"{_disagreement_text(m, k)}; {why}")
+                why = reason("surfaces_differ", f"{_look_alike_text(m, k)}; {why}")
             elif state.ambiguous[k]:
                 why = reason(
                     "contradicts_edge",
@@ -106,15 +106,15 @@ def _outcomes(
             if cycles.agree[k] > 0:
                 why += "; other edges that contradict them agree with it (a place that looks alike?)"
             if state.doubtful[k]:
-                why += f"; {_disagreement_text(m, k)}: two places that look alike"
+                why += f"; {_look_alike_text(m, k)}"
             doubtful = "tentative" in (status[m.targets[k]], status[m.sources[k]])
             undecided = bool(cycles.agree[k] > 0 or doubtful or state.undecided[k] or state.rejected[k])
             out[key] = EdgeOutcome("unused", residual, why, undecided)
     return out
 
 
-def _disagreement_text(m: Measurements, row: int) -> str:
-    return f"{m.disagreement[row]:.0%} of what both saw is not the same"
+def _look_alike_text(m: Measurements, row: int) -> str:
+    return f"the captures show two places that look alike with a probability of {m.look_alike[row]:.0%}"
 
 
 def _statuses(m: Measurements, accepted: np.ndarray, firm: np.ndarray) -> np.ndarray:

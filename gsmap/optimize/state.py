@@ -31,7 +31,7 @@ class State:
         undecided, rejected: (E,) masks of edges that perceptual aliasing leaves undecided, and of wrong edges.
         terms: priors in use.
         pending: reason by row of an edge why the edge's components may not join.
-        doubtful: (E,) mask of edges whose captures disagree on too much of their common surface.
+        doubtful: (E,) mask of edges whose captures may show two places that look alike.
         ambiguous: (E,) mask of edges that contradict each other without evidence to decide.
     """
 

@@ -103,9 +103,7 @@ def select_pose(
         why = reason("ambiguous", f"ambiguous: {told} is correct with a probability of {probable:.0%}")
     elif accepted and alike > 1.0 - params.verdict.min_probability:
         status = "rejected"
-        why = reason(
-            "look_alike", f"two places that look alike, or one that was refurnished: {alike:.0%} for the former"
-        )
+        why = reason("look_alike", f"two places that look alike ({alike:.0%}), or one place that was refurnished")
     elif not accepted and not verdict.has_low_nfa(best.proposal, params.verdict):
         status, why = "no_match", verdict.not_significant(best.proposal, params.verdict, best.flaw)
     information = None

@@ -85,6 +85,7 @@ class EdgeSummary(NamedTuple):  # created for every pair in every update: ten ti
     Args:
         pair: both ids with a colon between them, the lower first.
         usable: as `StoredRegistration.is_usable`.
+        look_alike: probability of two places that look alike, and
         disagreement: fraction of the surface seen by both scenes on which they disagree; NaN if unknown, not accepted,
             or not read.
         history_keys: keys of all computed registrations of the pair; None if there is one, or if they were not read.
@@ -97,6 +98,7 @@ class EdgeSummary(NamedTuple):  # created for every pair in every update: ten ti
     key: str
     review: str | None
     usable: bool
+    look_alike: float = _UNKNOWN
     disagreement: float = _UNKNOWN
     history_keys: frozenset[str] | None = None
 
@@ -596,13 +598,12 @@ def _add_summaries(summaries: dict[str, EdgeSummary], rows: Iterable[Sequence[An
     for number, target, source, pair, key, status, posed, evidence in rows:
         before = summaries.get(pair)
         keys = None if before is None else before.keys | {key} - {""}
-        disagreement = _UNKNOWN if evidence is None else _disagreement(evidence)
         usable = bool(posed) and _is_usable(status, None)
-        summaries[pair] = EdgeSummary(number, target, source, pair, key, None, usable, disagreement, keys)
+        summaries[pair] = EdgeSummary(number, target, source, pair, key, None, usable, *_figures(evidence), keys)
 
 
 def _unreviewed_summaries(connection: Connection, wanted: ColumnElement[bool]) -> list[EdgeSummary]:
-    """Return summaries of unreviewed pairs, without disagreement and history keys."""
+    """Return summaries of unreviewed pairs, without evidence and history keys."""
     rows = connection.execute(_unreviewed((*_SUMMARY_COLUMNS, null())).where(wanted)).all()
     return [_summary(tuple(row), None, {}) for row in rows]
 
@@ -633,20 +634,28 @@ _ends_of = attrgetter("target", "source")
 
 def _summary(row: tuple[Any, ...], review: Review | None, history_keys: Mapping[str, set[str]]) -> EdgeSummary:
     number, target, source, pair, key, status, posed, evidence = row
-    disagreement = _UNKNOWN if evidence is None else _disagreement(evidence)
     value = None if review is None else review.review
     usable = bool(posed) and _is_usable(status, value)
     keys = frozenset(history_keys[pair] - {""}) if pair in history_keys else None
-    return EdgeSummary(number, target, source, pair, key, value, usable, disagreement, keys)
+    return EdgeSummary(number, target, source, pair, key, value, usable, *_figures(evidence), keys)
 
 
-def _disagreement(evidence: str) -> float:
-    """Parse the disagreement in the evidence, without decoding the rest of the JSON object."""
-    _, named, after = evidence.partition('"disagreement":')
-    if named and evidence.count("{") == 1 and '"disagreement"' not in after:
+def _figures(evidence: str | None) -> tuple[float, float]:
+    """Parse the figures of the evidence that summaries hold."""
+    if evidence is None:
+        return _UNKNOWN, _UNKNOWN
+    return _figure(evidence, "look_alike"), _figure(evidence, "disagreement")
+
+
+def _figure(evidence: str, name: str) -> float:
+    """Parse one figure of the evidence, without decoding the rest of the JSON object."""
+    if f'"{name}"' not in evidence:
+        return _UNKNOWN
+    _, named, after = evidence.partition(f'"{name}":')
+    if named and evidence.count("{") == 1 and f'"{name}"' not in after:
         with suppress(ValueError):
             return float(after[: after.find("," if "," in after else "}")])
-    return float(_OBJECT.process_result_value(evidence, None).get("disagreement", _UNKNOWN))
+    return float(_OBJECT.process_result_value(evidence, None).get(name, _UNKNOWN))
 
 
 def _stored_all(chosen: Sequence[_CurrentRow]) -> list[StoredRegistration]:

@@ -24,12 +24,14 @@ class Edge:
             ``S = S_hat * Exp(xi)`` with the exact Sim(3) exponential (`gsmap.geometry.similarities`), translation in
             the source's unit; that of a rigid edge says how surely its scale is 1.
         confirmed: a person vouches for it: it joins components by itself and is never voted out.
-        disagreement: of the surface that both scenes saw under this pose, the share that is not the same in both (a
-            place that changed, or two that look alike); NaN where nobody looked.
+        disagreement: of the surface that both scenes saw under this pose, the share that is not the same in both; NaN
+            where nobody looked. Ranks edges of unknown likelihood.
         same_visit: both were captured so shortly after each other that next to nothing can have changed.
         log_odds_wrong: natural log-odds that the pose is wrong, by the evidence of registration and up to a constant
             that all edges share (`gsmap.optimize.edge_likelihood`); NaN where that is not known.
         duplicate: both scenes were made from one capture, so each repeats the measurements of the other.
+        look_alike: the probability that both scenes show two places that look alike, rather than one; NaN where
+            nothing tells.
     """
 
     target: str
@@ -41,6 +43,7 @@ class Edge:
     same_visit: bool = False
     log_odds_wrong: float = float("nan")
     duplicate: bool = False
+    look_alike: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)

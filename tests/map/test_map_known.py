@@ -46,7 +46,7 @@ def test_a_second_look_finds_what_a_first_one_would(street: Filled) -> None:
             key = mine.key(a, b) if kind else RecipeKey("register", "other", {}).of(a, b, str(step))
             edge = Registration(a, b, "no_match")
             if rng.integers(2):
-                pose, evidence = (Sim3.identity(), np.eye(7)), {"disagreement": float(rng.choice([0.01, 9.0]))}
+                pose, evidence = (Sim3.identity(), np.eye(7)), {"look_alike": float(rng.choice([0.001, 0.9]))}
                 edge = Registration(a, b, "accepted", "", *pose, evidence=evidence)
             store.registrations.save(edge, key)
         elif kind == 2 and (stored.review or stored.manual):

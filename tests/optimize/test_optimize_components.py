@@ -14,8 +14,9 @@ def test_bridges_are_networkx_bridges():
         b = (a + rng.integers(1, n, e)) % n
         accepted = rng.random(e) < 0.8
         ids, flags, unknown = tuple(map(str, range(n))), np.zeros(e, dtype=bool), np.full(e, np.nan)
+        information = np.tile(np.eye(6), (e, 1, 1))
         m = Measurements(
-            ids, a, b, Similarities.identity(e), np.tile(np.eye(6), (e, 1, 1)), flags, unknown, flags, unknown, flags
+            ids, a, b, Similarities.identity(e), information, flags, unknown, unknown, flags, unknown, flags
         )
         graph = networkx.MultiGraph()
         graph.add_edges_from([(x, y) for x, y, k in zip(a, b, accepted, strict=True) if k])

@@ -1,4 +1,4 @@
-"""Edges whose captures disagree in what both saw: what the map bears out, contradicts, or leaves open."""
+"""Edges whose captures may show two places: what the map bears out, contradicts, or leaves open."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from gsmap.optimize.aliasing_evidence import aliasing_probability, separating_th
 from gsmap.types import Sim3
 
 QUICK = Params(marginals=False)
-SURE, DOUBTFUL = 0.05, 0.2
+SURE, DOUBTFUL = 0.005, 0.02
 ROOM_M = 4.5
 
 
@@ -25,7 +25,7 @@ class Street:
         truth.rotations[:] = truth.rotations[:1]
         self.ids = [f"s{k:02d}" for k in range(count)]
         chain = np.c_[np.arange(count - 1), np.arange(1, count)]
-        self.right = [replace(e, disagreement=SURE) for e in true_edges(truth, chain, rng, self.ids)]
+        self.right = [replace(e, look_alike=SURE) for e in true_edges(truth, chain, rng, self.ids)]
         self.wrong = []
         for a in range(count):
             for b in range(a + period - 1, count):
@@ -34,7 +34,7 @@ class Street:
                     looks = truth.replaced(np.array([b]), poses_at(at[[a]] + [ROOM_M * seems, 0, 0]))
                     looks.rotations[:] = truth.rotations
                     (edge,) = true_edges(looks, np.array([(a, b)]), rng, self.ids)
-                    self.wrong.append(replace(edge, disagreement=DOUBTFUL))
+                    self.wrong.append(replace(edge, look_alike=DOUBTFUL))
 
     def without(self, *gone):
         keep = [s for k, s in enumerate(self.ids) if k not in gone]
@@ -56,7 +56,7 @@ def components(answer):
 @pytest.mark.guards("answers")
 def test_a_street_of_look_alikes_is_laid_out_as_it_is():
     street = Street()
-    blind = [replace(e, disagreement=float("nan")) for e in street.right + street.wrong]
+    blind = [replace(e, look_alike=float("nan")) for e in street.right + street.wrong]
     unseeing = optimize(street.ids, blind, params=QUICK)
     assert "used" in uses(unseeing, street.wrong) or len(components(unseeing)) > 1
     answer = optimize(street.ids, street.right + street.wrong, params=QUICK)
@@ -66,7 +66,7 @@ def test_a_street_of_look_alikes_is_laid_out_as_it_is():
     where = np.array([answer.poses[s].S_map_scene.translation for s in street.ids])
     assert np.linalg.norm(where[-1] - where[0]) == pytest.approx(13 * ROOM_M, abs=1.0)
     reason = answer.outcomes[street.wrong[0].target, street.wrong[0].source].reason
-    assert "20%" in reason
+    assert "2%" in reason
     assert "look alike" in reason
 
 
@@ -91,9 +91,9 @@ def test_a_place_that_changed_is_tied_tentatively():
     truth = poses_at(rng.uniform(0, 8, (6, 3)))
     ids = [f"s{k}" for k in range(6)]
     sure = [(0, 1), (1, 2), (0, 2), (3, 4), (4, 5), (3, 5)]
-    known = [replace(e, disagreement=SURE) for e in true_edges(truth, np.array(sure), rng, ids)]
+    known = [replace(e, look_alike=SURE) for e in true_edges(truth, np.array(sure), rng, ids)]
     between = np.array([(0, 3), (1, 4), (2, 5)])
-    doubtful = [replace(e, disagreement=DOUBTFUL) for e in true_edges(truth, between, rng, ids)]
+    doubtful = [replace(e, look_alike=DOUBTFUL) for e in true_edges(truth, between, rng, ids)]
     answer = optimize(ids, known + doubtful, params=QUICK)
     assert uses(answer, known) == {"used"}
     assert uses(answer, doubtful) == {"tentative"}
@@ -114,9 +114,9 @@ def test_what_the_others_bear_out_is_used(given):
     truth = poses_at(rng.uniform(0, 8, (4, 3)))
     ids = [f"s{k}" for k in range(4)]
     known = true_edges(truth, np.array([(0, 1), (1, 2), (0, 2), (2, 3), (0, 3)]), rng, ids)
-    known = [replace(e, disagreement=given) for e in known]
+    known = [replace(e, look_alike=given) for e in known]
     (odd,) = true_edges(truth, np.array([(1, 3)]), rng, ids)
-    answer = optimize(ids, [*known, replace(odd, disagreement=DOUBTFUL)], params=QUICK)
+    answer = optimize(ids, [*known, replace(odd, look_alike=DOUBTFUL)], params=QUICK)
     assert answer.use("s1", "s3") == "used"
 
 
@@ -128,11 +128,11 @@ def test_what_is_borne_out_confirms_unless_the_map_has_look_alikes(contradicted)
     ids = [f"s{k}" for k in range(6)]
     known = true_edges(truth, np.array([(0, 1), (1, 2), (3, 4), (4, 5), (3, 5)]), rng, ids)
     third, other = true_edges(truth, np.array([(0, 2), (3, 5)]), rng, ids)
-    known = [replace(e, disagreement=SURE) for e in known[: 4 if contradicted else 5]]
-    given = [*known, replace(third, disagreement=DOUBTFUL)]
+    known = [replace(e, look_alike=SURE) for e in known[: 4 if contradicted else 5]]
+    given = [*known, replace(third, look_alike=DOUBTFUL)]
     if contradicted:
         moved = Sim3(other.S_target_source.rotation, np.array([4.0, 0, 0]) + other.S_target_source.translation)
-        given.append(replace(other, S_target_source=moved, disagreement=DOUBTFUL))
+        given.append(replace(other, S_target_source=moved, look_alike=DOUBTFUL))
     answer = optimize(ids, given, params=QUICK)
     triangle = {answer.use(*pair) for pair in (("s0", "s1"), ("s1", "s2"), ("s0", "s2"))}
     assert triangle == ({"tentative"} if contradicted else {"used"})
@@ -141,7 +141,7 @@ def test_what_is_borne_out_confirms_unless_the_map_has_look_alikes(contradicted)
 @pytest.mark.guards("answers")
 def test_a_confirmed_edge_is_in_no_doubt():
     street = Street(4, period=2)
-    word = replace(street.right[1], disagreement=0.5, confirmed=True)
+    word = replace(street.right[1], look_alike=0.5, confirmed=True)
     answer = optimize(street.ids, [street.right[0], word, street.right[2]], params=QUICK)
     assert answer.use(word.target, word.source) == "used"
     assert components(answer) == [street.ids]
@@ -154,17 +154,18 @@ def test_the_rule_of_succession():
 
 
 def test_where_doubt_begins_is_told_by_the_map():
-    """One look-alike disagrees in less than the setting bears: the edges that disagree in still less contradict it."""
+    """One look-alike is less probable than the setting bears: edges that are still less so contradict it."""
     street = Street()
-    quiet = [replace(e, disagreement=0.09) if k == 3 else e for k, e in enumerate(street.wrong)]
-    noisy = [replace(e, disagreement=0.08) if k == 5 else e for k, e in enumerate(street.right)]
+    quiet = [replace(e, look_alike=0.009) if k == 3 else e for k, e in enumerate(street.wrong)]
+    noisy = [replace(e, look_alike=0.008) if k == 5 else e for k, e in enumerate(street.right)]
+    noisy, quiet = ([replace(e, disagreement=10 * e.look_alike) for e in edges] for edges in (noisy, quiet))
     answer = optimize(street.ids, noisy + quiet, params=QUICK)
     assert uses(answer, quiet) == {"unused"}
     assert components(answer) == [street.ids]
     # Bare and noisy maps in which nothing is contradicted are in no doubt below the setting.
-    alone = [replace(e, disagreement=0.09) for e in street.right]
+    alone = [replace(e, look_alike=0.009) for e in street.right]
     assert uses(optimize(street.ids, alone, params=QUICK), alone) == {"tentative"}
-    assert "not the same" not in optimize(street.ids, alone, params=QUICK).outcomes["s00", "s01"].reason
+    assert "look alike" not in optimize(street.ids, alone, params=QUICK).outcomes["s00", "s01"].reason
 
 
 @pytest.mark.guards("answers")

@@ -41,7 +41,7 @@ def test_the_key_names_versions_and_the_solver(monkeypatch):
         {"max_unchanged_sigmas": -1.0},
         {"max_tilt_deg": -1.0},
         {"min_large_component": 0},
-        {"max_disagreement": 1.0},
+        {"max_look_alike": 1.0},
         {"same_visit_h": -1.0},
         {"max_growth": -0.1},
     ],

@@ -14,7 +14,7 @@ from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.geometry.rotations import exp_so3
 from gsmap.store import Store, matrices
 from gsmap.store import registrations as module
-from gsmap.store.registrations import Registrations, _disagreement
+from gsmap.store.registrations import Registrations, _figure
 from gsmap.store.schema import edges, poses, registrations, results, reviews
 from gsmap.types import EdgeOutcome, PoseGraph, Registration, SceneGraph, ScenePose, Sim3
 
@@ -362,7 +362,7 @@ def test_graphs_are_listed_from_memory_until_they_are_replaced(store):
 )
 def test_what_disagrees_is_read_as_json_says_it(text, said):
     assert np.array_equal(json.loads(text).get("disagreement", np.nan), said, equal_nan=True)
-    assert np.array_equal(_disagreement(text), said, equal_nan=True)
+    assert np.array_equal(_figure(text, "disagreement"), said, equal_nan=True)
 
 
 def test_of_pairs_and_graphs_what_is_new_is_read(store, monkeypatch):

@@ -7,10 +7,10 @@
     python -m tools.bench.alike --cache /tmp/streets --leave-out e,k       # without some captures: the street has gaps
 
 Makes the street (`gsmap_synthetic.streets`), captures every two neighbouring rooms of it, and lets `update` make a map
-of the captures; all of it is kept under ``--cache``. Prints the accepted edges, right and wrong, by overlap and by what
-of the surface seen twice disagrees; then what the pose graph makes of them, once ``blind`` to what disagrees and once
-as it is: edges used and tentative, scenes placed and tentative, components, and how many of these are folded (a scene
-lies more than 1 m from where the truth has it in the component's frame).
+of the captures; all of it is kept under ``--cache``. Prints the accepted edges, right and wrong, by overlap and by the
+probability of two places; then what the pose graph makes of them, once ``blind`` to that and once as it is: edges used
+and tentative, scenes placed and tentative, components, and how many of these are folded (a scene lies more than 1 m
+from where the truth has it in the component's frame).
 """
 
 from __future__ import annotations
@@ -111,8 +111,8 @@ def report(street: Street, left_out: set[str]) -> None:
     print(f"{len(kept)} captures, {len(edges)} accepted edges")
     for name, wanted in (("right", True), ("wrong", False)):
         rows = [e for e in edges if street.is_right(e.target, e.source) == wanted]
-        overlap, disagreement = [overlaps[e.target, e.source] for e in rows], [e.disagreement for e in rows]
-        print(f"  {name} {len(rows):3d}   overlap {spread(overlap)}   disagreement {spread(disagreement)}")
+        overlap, look_alike = [overlaps[e.target, e.source] for e in rows], [e.look_alike for e in rows]
+        print(f"  {name} {len(rows):3d}   overlap {spread(overlap)}   look-alike {spread(look_alike)}")
     neighbours = [(a, b) for i, a in enumerate(kept) for b in kept[i + 1 :] if street.is_right(a, b)]
     found = {frozenset((e.target, e.source)) for e in edges}
     print(
@@ -122,7 +122,7 @@ def report(street: Street, left_out: set[str]) -> None:
         "           right: used tentative unused   wrong: used tentative unused   scenes: placed tentative alone   "
         "components  folded"
     )
-    blind = [replace(edge, disagreement=float("nan"), log_odds_wrong=float("nan")) for edge in edges]
+    blind = [replace(edge, look_alike=float("nan"), log_odds_wrong=float("nan")) for edge in edges]
     for name, given in (("blind", blind), ("as it is", edges)):
         answer = optimize(kept, given, params=replace(settings.optimize, marginals=False))
         print(row_of(name, street, answer))

@@ -257,12 +257,12 @@ def run_twins(seeds: int, share: float, seeing: bool) -> dict:
 
 
 def disagreeing(world, seed: int) -> list:
-    """The edges with what their captures disagree in."""
+    """The edges with the probability that their captures show two places."""
     from dataclasses import replace
 
-    middle = np.where(world.wrong, 0.157, 0.056)
+    middle = np.where(world.wrong, 0.0157, 0.0056)
     values = middle * np.exp(np.random.default_rng(seed).normal(0, 0.2, len(middle)))
-    return [replace(edge, disagreement=float(v)) for edge, v in zip(world.edges, values, strict=True)]
+    return [replace(edge, look_alike=float(v)) for edge, v in zip(world.edges, values, strict=True)]
 
 
 def run_g2o(task: dict) -> dict:

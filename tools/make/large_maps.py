@@ -184,9 +184,9 @@ class Filled:
         step[0, 6] = 0
         S = self.truth(i).inverse() @ self.truth(j) @ exp(step).item(0)
         information = np.diag(_SIGMAS**-2.0)
-        # Of its own: where all pairs disagree alike, one that noise has thrown out puts all the others in doubt.
+        # Of its own: where all pairs are as doubtful, one that noise has thrown out puts all the others in doubt.
         evidence = dict(self.made.accepted.evidence)
-        evidence["disagreement"] = evidence.get("disagreement", 0.01) * float(np.exp(rng.normal(0, 0.5)))
+        evidence["look_alike"] = evidence.get("look_alike", 0.001) * float(np.exp(rng.normal(0, 0.5)))
         return replace(
             self.made.accepted,
             target=target,

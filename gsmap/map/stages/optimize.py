@@ -124,6 +124,7 @@ def _edges(store: Store, basis: PoseBasis, among: Collection[str] | None = None)
             information=stored.registration.information,
             confirmed=stored.review == "confirm",
             disagreement=stored.registration.evidence.get("disagreement", float("nan")),
+            look_alike=stored.registration.evidence.get("look_alike", float("nan")),
             same_visit=(stored.registration.target, stored.registration.source) in basis.same_visits,
             log_odds_wrong=solver.log_odds_wrong(stored.registration.evidence, stored.registration.overlap),
             duplicate=any(note.startswith(SAME_CAPTURE) for note in stored.registration.notes),

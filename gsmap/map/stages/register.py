@@ -155,7 +155,7 @@ class RegisteredPairs:
         """Read all current registrations and classify those that changed."""
         by = (
             work.recipe.recipe,
-            work.settings.optimize.max_disagreement,
+            work.settings.optimize.max_look_alike,
             {scene: key.digest for scene, key in work.graphs.items()},
         )
         tried = work.store.registrations.all_summaries()
@@ -168,7 +168,7 @@ class RegisteredPairs:
             self._judge_all(work, tried)
 
     def _judge_all(self, work: _RegistrationContext, tried: Sequence[EdgeSummary]) -> None:
-        judged, digest_of, (_, max_disagreement, graphs) = self._judged, work.recipe.digest_of, self._by
+        judged, digest_of, (_, max_look_alike, graphs) = self._judged, work.recipe.digest_of, self._by
         for one in tried:
             pair = one.pair
             if judged.get(pair) is one:
@@ -190,7 +190,7 @@ class RegisteredPairs:
                 self._registered.add(pair)
             if not current and not one.is_specified:
                 self._replaced[pair] = (a, b), one.keys
-            elif one.usable and (one.is_specified or not one.disagreement > max_disagreement):
+            elif one.usable and (one.is_specified or not one.look_alike > max_look_alike):
                 self.held[pair] = (a, b)
 
     def _adopt(self, work: _RegistrationContext, pair: Pair, keys: frozenset[str]) -> bool:
@@ -233,7 +233,7 @@ def _register_candidates(work: _RegistrationContext, known: RegisteredPairs) -> 
     beside: dict[str, list[Pair]] = {}
     for pair in neighbours({s: at for s, at in placed_scenes(store).items() if s in work.described}, params):
         beside.setdefault(pair[0], []).append(pair)
-    bar = work.settings.optimize.max_disagreement
+    bar = work.settings.optimize.max_look_alike
     # Next to all neighbours have been tried; a list with one that has not keeps them all, and so its order.
     proposed = [*lists.values(), *(pairs for pairs in beside.values() if not all(known.has(*pair) for pair in pairs))]
     tried = {pair for pairs in proposed for pair in pairs if known.has(*pair)}
@@ -243,7 +243,7 @@ def _register_candidates(work: _RegistrationContext, known: RegisteredPairs) -> 
         found = work.register(pairs, after=0)
         made += found
         for edge in found:
-            if edge.status == "accepted" and not edge.evidence.get("disagreement", np.nan) > bar:
+            if edge.status == "accepted" and not edge.evidence.get("look_alike", np.nan) > bar:
                 rounds.add_edge(edge.target, edge.source)
         pairs = rounds.next()
     if lists:
