@@ -324,8 +324,8 @@ def refuse_options(context: typer.Context, options: Sequence[str], what: str) ->
     """Raise an error for the first of these options that a command was given."""
     from gsmap.errors import ConfigError
 
-    given = (one for one in context.command.params if context.params[str(one.name)] not in (None, False))
-    names = {name for one in given for name in one.opts}
+    values = ((one.opts, context.params[str(one.name)]) for one in context.command.params)
+    names = {name for opts, value in values if value is not None and value is not False for name in opts}
     if useless := [option for option in options if option in names]:
         raise ConfigError(f"{useless[0]} does not apply to {what}", code="conflicting_options")
 

@@ -209,6 +209,24 @@ def test_a_failure_with_json_is_one_object_with_a_code(empty: Path, cli: Run) ->
     assert cli("list", empty, "tiles", "--set", "no.such=1", "--json").code == 2
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("list", "MAP", "revisions", "--component", 0),
+        ("list", "MAP", "tiles", "--tag", ""),
+        ("export", "MAP", "map.html", "--format", "html", "--component", 0),
+        ("export", "MAP", "map.html", "--format", "html", "--static"),
+        ("export", "MAP", "plan.tif", "--wait"),
+    ],
+)
+def test_an_option_that_does_not_apply_is_refused_even_if_it_is_zero(
+    empty: Path, cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = cli(*(empty if word == "MAP" else word for word in words), "--json")
+    assert done.json["error"]["code"] == "conflicting_options"
+
+
 @pytest.mark.usefixtures("broken_list")
 def test_an_internal_error_with_json_has_a_code(empty: Path, cli: Run, logs: Path) -> None:
     assert cli("list", empty, "scenes", "--json").json["error"]["code"] == "internal_error"
