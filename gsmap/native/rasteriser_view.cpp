@@ -88,7 +88,7 @@ void View::draw(const Scene &scene, const Camera &camera, const std::vector<Cand
 int64_t View::split(const std::vector<Part> &given, float limit) {
     std::vector<Part> parts(given);
     const Record *records = records_.get();
-    std::vector<uint32_t> slots(parts.size());
+    std::vector<int64_t> slots(parts.size());  // the kept records alone may touch more tiles than 32 bits count
     const auto is_seen = [&](const Record &r) {
         for (int ty = r.ty0; ty < r.ty1; ty++)
             for (int tx = r.tx0; tx < r.tx1; tx++)

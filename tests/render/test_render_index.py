@@ -67,6 +67,22 @@ def test_index_changes_no_bit_where_much_is_hidden_and_depths_are_equal():
     assert (all_.alpha > 0.999).mean() > 0.5
 
 
+@pytest.mark.slow
+def test_too_many_intersections_of_records_that_are_kept_are_refused():
+    # All chunks begin before the camera, so that all records are kept to the last round; each touches 8,160 tiles.
+    gaussians = Gaussians(
+        np.tile(np.float32([0, 0, 5]), (540_000, 1)),
+        np.tile(np.float32([1, 0, 0, 0]), (540_000, 1)),
+        np.full((540_000, 3), 4, np.float32),
+        np.full(540_000, -3, np.float32),
+        np.zeros((540_000, 1, 3), np.float32),
+    )
+    gaussians.means[::1000, 2] = -5
+    cameras = Cameras(np.eye(4)[None], [[2000, 2000, 1920, 1080]], [[3840, 2160]])
+    with pytest.raises(RuntimeError, match="intersections"):
+        render(gaussians, cameras, depth=False, dominant_id=False, index=ChunkIndex.build(gaussians, chunk=1000))
+
+
 def test_gradients_go_through_the_index():
     gaussians = site(20_000, 2, -2.0)
     index = ChunkIndex.build(gaussians, chunk=64)
