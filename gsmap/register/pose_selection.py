@@ -90,9 +90,10 @@ def select_pose(
     num_as_similar = len(as_similar) + sum(not similarity < least for similarity in elsewhere)
     others = [j for j in others if j not in as_similar]
     alike = look_alike_probability(best.evidence, best.similarity)
-    probable = _probability_among(best, others, num_as_similar) * (1.0 - float(np.nan_to_num(alike)))
+    among = _probability_among(best, others, num_as_similar)
+    probable = among * (1.0 - float(np.nan_to_num(alike)))
     rivals = as_similar or [j for j in others if verdict.is_acceptable(j.proposal, j.evidence, params.verdict)]
-    if probable < params.verdict.min_probability:
+    if among < params.verdict.min_probability:
         rivals = rivals or sorted(others, key=lambda j: -odds_of(j))
     if accepted and (rivals or num_as_similar):
         status = "no_match"
@@ -107,7 +108,7 @@ def select_pose(
     elif not accepted and not verdict.has_low_nfa(best.proposal, params.verdict):
         status, why = "no_match", verdict.not_significant(best.proposal, params.verdict, best.flaw)
     information = None
-    if status == "accepted" and best.covariance is not None:
+    if accepted and status != "no_match" and best.covariance is not None:  # a person may confirm a refused pair
         information = np.linalg.inv(best.covariance)
         information = 0.5 * (information + information.T)
         if best.decision is not None and best.decision.note:

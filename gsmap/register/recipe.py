@@ -12,7 +12,7 @@ from gsmap.register.params import Params
 from gsmap.register.refinement import refiner_for
 from gsmap.types.plain import plain
 
-VERSION = 18
+VERSION = 19
 PREPARE_VERSION = 1
 
 _RENDER_BACKEND = "native"  # all renders of this room use it

@@ -65,9 +65,26 @@ def test_a_pair_of_twin_flats_is_refused_with_its_pose(monkeypatch: pytest.Monke
     assert (accepted.status, accepted.reason_code) == ("accepted", "")
     assert (refused.status, refused.reason_code) == ("rejected", "look_alike")
     assert refused.S_target_source is not None
-    assert refused.information is None
+    assert refused.information is not None  # of the edge that a person may confirm
     assert refused.evidence["probability"] < 0.5 < refused.evidence["look_alike"]
     assert refused.evidence["similarity"] == 0.7
     unknown = register(replace(TWIN, free_space_violation=NAN), NAN)
     assert unknown.status == "accepted"
     assert np.isnan(unknown.evidence["look_alike"])
+
+
+@pytest.mark.guards("answers")
+def test_a_weak_rival_does_not_make_twin_flats_ambiguous(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pose_selection, "own_working_m", lambda view: 1.0)
+    proposal = Proposal("graph:landmarks", Sim3.identity(), False, 80, 100, log_nfa=-100.0, runner_up=0.0)
+    moved = Sim3(np.eye(3), np.array([5.0, 0, 0]))
+    elsewhere = replace(proposal, S_target_source=moved, log_nfa=-3.0)
+    weak = replace(SAME, colour_correlation=0.16, colour_t=1.0, overlap=0.02, num_coinciding=310, num_seen=400)
+    scene = SimpleNamespace(id="a", centre=np.zeros(3), graph=SimpleNamespace(unit_m=1.0))
+    poses = [
+        EvaluatedPose(proposal, TWIN, np.eye(7), "", similarity=0.7),
+        EvaluatedPose(elsewhere, weak, np.eye(7), "not probable enough"),
+    ]
+    found = select_pose(scene, SimpleNamespace(**vars(scene) | {"id": "b"}), poses, Params(), seconds={})
+    assert (found.status, found.reason_code) == ("rejected", "look_alike")
+    assert found.S_target_source is not None
