@@ -83,7 +83,7 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
     "contradicts_edges": ("The edge contradicts the other edges.", r"contradicts the other edges"),
     "outvoted": ("Too few edges agree against those that contradict them.", r"\d+ edges agree and \d+ others"),
     "surfaces_differ": (
-        "Both scenes saw different surfaces at the place.",
+        "Both scenes may show two places that look alike, or one that changed.",
         r"the captures show two places that look alike|\S+% of what both saw is not the same",
     ),
     "too_few_edges": ("Too few agreeing edges join two large components.", r"would join two (components|islands)"),

@@ -85,7 +85,7 @@ class EdgeSummary(NamedTuple):  # created for every pair in every update: ten ti
     Args:
         pair: both ids with a colon between them, the lower first.
         usable: as `StoredRegistration.is_usable`.
-        look_alike: probability of two places that look alike, and
+        look_alike: probability of two places that look alike; NaN as below.
         disagreement: fraction of the surface seen by both scenes on which they disagree; NaN if unknown, not accepted,
             or not read.
         history_keys: keys of all computed registrations of the pair; None if there is one, or if they were not read.
