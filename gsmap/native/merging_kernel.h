@@ -137,15 +137,18 @@ INLINE void keep_nearest(gsmap::Search &search, int point, int k) {
         return;
     }
     int8_t nearer[gsmap::Search::kRoom];
+    int before_last = 0;  // how many are nearer than the k-th, whose equals are left in what room remains
     for (int i = 0; i < count; ++i) {
         int before = 0;
         for (int first = 0; first < count; first += W)
             before += __builtin_popcount(bits(gt(set1(squared[i]), load(squared + first))));
         nearer[i] = int8_t(before);
+        before_last = before < k && before > before_last ? before : before_last;
     }
     float bound = 0;
+    int room = k - before_last;
     for (int i = 0; i < count; ++i) {
-        const bool stays = (nearer[i] < k) & (kept < k);
+        const bool stays = nearer[i] < before_last || (nearer[i] == before_last && room-- > 0);
         const float d = squared[i];
         squared[kept] = d, row[kept] = row[i];
         bound = stays && d > bound ? d : bound;

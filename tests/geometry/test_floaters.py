@@ -1,6 +1,7 @@
 """Floaters are told from the surface, and the surface from floaters."""
 
 import numpy as np
+import pytest
 from scipy.spatial import cKDTree
 
 from gsmap.geometry.floaters import find_floaters
@@ -40,3 +41,13 @@ def test_floaters_are_those_of_the_plain_computation():
     stray, spacing = find_floaters(points, colours, 0.4)
     np.testing.assert_array_equal(stray, foreign | alone)
     np.testing.assert_allclose(spacing, distances[:, 8])
+
+
+@pytest.mark.usefixtures("instruction_set")
+def test_neighbours_that_are_equally_near_do_not_displace_nearer_ones():
+    rng = np.random.default_rng(2)
+    for size in (20, 90, 400):
+        for spread in (0.3, 1.0, 3.0):
+            points = np.round(rng.normal(0, spread, (size, 3))).astype(np.float32)  # as files of few bits have them
+            far = np.sort(np.linalg.norm(points[:, None].astype(float) - points, axis=2), axis=1)[:, 8]
+            np.testing.assert_allclose(find_floaters(points, points, 0.1)[1], far)
