@@ -89,7 +89,7 @@ def elsewhere() -> World:
 @pytest.fixture(scope="session")
 def flat(tmp_path_factory: pytest.TempPathFactory) -> Flat:
     path = tmp_path_factory.mktemp("flat") / "flat.gsmap"
-    captures = make_captures(SEED, 2, steps=0, num_frames=18, num_gaussians=20_000, size_px=SIZE_PX)
+    captures = make_captures(SEED, 2, steps=0, num_frames=24, num_gaussians=20_000, size_px=SIZE_PX)
     with gsmap.map.create(path) as m:
         m.change_settings({"describe.objects": False, "describe.things": False})
         for capture in captures:
