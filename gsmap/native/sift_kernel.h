@@ -25,7 +25,10 @@ void add_slopes(const gsmap::SlopeGrid &grid, const float *length, const float *
     for (int i = 0; i < count; i += W) {
         const V dx = iota() + float(from + i) - grid.x;
         const V nx = grid.cosine * dx + across, ny = down - grid.sine * dx;
-        const M live = both(first_lanes(count - i), both(lt(abs(nx), half), lt(abs(ny), half)));
+        const V px = nx + half, py = ny + half;
+        // Sums are compared, not offsets, because a sum may round up to the end.
+        const M inside = both(both(lt(V{}, px), lt(px, half + half)), both(lt(V{}, py), lt(py, half + half)));
+        const M live = both(first_lanes(count - i), inside);
         const V turned = loadu(angle + i) - grid.turned;
         const V turn = select(lt(turned, V{}), turned + kTurn, turned) * (kSlopeTurns / kTurn);
         const V far = (nx * nx + ny * ny) / 8.f * grid.fading_per_unit;
@@ -33,7 +36,6 @@ void add_slopes(const gsmap::SlopeGrid &grid, const float *length, const float *
         V here, next;
         for (int l = 0; l < W; l++) here[l] = grid.fading[entry[l]], next[l] = grid.fading[entry[l] + 1];
         const V weight = loadu(length + i) * (here + (far - __builtin_convertvector(entry, V)) * (next - here));
-        const V px = nx + half, py = ny + half;
         const I column = __builtin_convertvector(px, I), row = __builtin_convertvector(py, I);
         const I sector = __builtin_convertvector(min(turn, set1(kSlopeTurns - 1.f)), I);
         const V rx = px - __builtin_convertvector(column, V), ry = py - __builtin_convertvector(row, V);

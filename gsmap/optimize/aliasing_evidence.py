@@ -37,10 +37,10 @@ _STEPS = 64  # maximum number of steps in which edges are accepted by likelihood
 
 
 def find_doubtful(m: Measurements, bar: float) -> np.ndarray:
-    """Return an (E,) mask that is True for doubtful edges: the probability of two places is ``bar`` or more, and
+    """Return an (E,) mask that is True for doubtful edges: the probability of two places is above ``bar``, and
     no person confirmed the edge."""
     with np.errstate(invalid="ignore"):  # NaN: unknown, hence not doubtful
-        found: np.ndarray = (m.look_alike >= bar) & ~m.confirmed
+        found: np.ndarray = (m.look_alike > bar) & ~m.confirmed
     return found
 
 

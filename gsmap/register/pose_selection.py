@@ -92,8 +92,9 @@ def select_pose(
     alike = look_alike_probability(best.evidence, best.similarity)
     among = _probability_among(best, others, num_as_similar)
     probable = among * (1.0 - float(np.nan_to_num(alike)))
+    bar = params.verdict.min_probability
     rivals = as_similar or [j for j in others if verdict.is_acceptable(j.proposal, j.evidence, params.verdict)]
-    if among < params.verdict.min_probability:
+    if among < bar:
         rivals = rivals or sorted(others, key=lambda j: -odds_of(j))
     if accepted and (rivals or num_as_similar):
         status = "no_match"
@@ -102,7 +103,7 @@ def select_pose(
         else:
             told = f"the surfaces are as similar under {counted(num_as_similar, 'other pose')}, and this one"
         why = reason("ambiguous", f"ambiguous: {told} is correct with a probability of {probable:.0%}")
-    elif accepted and alike > 1.0 - params.verdict.min_probability:
+    elif accepted and (alike > 1.0 - bar or probable < bar <= among):
         status = "rejected"
         why = reason("look_alike", f"two places that look alike ({alike:.0%}), or one place that was refurnished")
     elif not accepted and not verdict.has_low_nfa(best.proposal, params.verdict):

@@ -88,3 +88,19 @@ def test_a_weak_rival_does_not_make_twin_flats_ambiguous(monkeypatch: pytest.Mon
     found = select_pose(scene, SimpleNamespace(**vars(scene) | {"id": "b"}), poses, Params(), seconds={})
     assert (found.status, found.reason_code) == ("rejected", "look_alike")
     assert found.S_target_source is not None
+
+
+@pytest.mark.guards("answers")
+@pytest.mark.parametrize(("alike", "status"), [(0.01, "accepted"), (0.05, "rejected"), (0.2, "rejected")])
+def test_no_pair_is_accepted_below_the_least_probability(
+    monkeypatch: pytest.MonkeyPatch, alike: float, status: str
+) -> None:
+    monkeypatch.setattr(pose_selection, "own_working_m", lambda view: 1.0)
+    monkeypatch.setattr(pose_selection, "probability", lambda *_: 0.93)
+    monkeypatch.setattr(pose_selection, "look_alike_probability", lambda *_: alike)
+    proposal = Proposal("graph:landmarks", Sim3.identity(), False, 80, 100, log_nfa=-100.0, runner_up=0.0)
+    scene = SimpleNamespace(id="a", centre=np.zeros(3), graph=SimpleNamespace(unit_m=1.0))
+    pose = EvaluatedPose(proposal, SAME, np.eye(7), "", similarity=1.0)
+    found = select_pose(scene, SimpleNamespace(**vars(scene) | {"id": "b"}), [pose], Params(), seconds={})
+    assert found.evidence["probability"] == pytest.approx(0.93 * (1 - alike))
+    assert found.status == status
