@@ -87,26 +87,11 @@ def draw(
     index: ChunkIndex,
 ) -> None:
     """Render view ``i`` into ``images`` as `forward` does, faster, without the state for a backward pass."""
-    height, width = images["alpha"].shape[1:]
-    pose = np.ascontiguousarray(T_camera_frame[:3], dtype=np.float64)
     _check_index(index, arrays)
-    ranges, depths, blocks = index.candidates(pose, intrinsics_px, width, height, _BLOCK_PX)
-    view.draw(
-        *arrays,
-        pose=pose,
-        intrinsics=np.ascontiguousarray(intrinsics_px, dtype=np.float64),
-        width=width,
-        height=height,
-        ranges=ranges,
-        depths=depths,
-        blocks=blocks,
-        background=background,
-        colour=images["colour"][i],
-        depth=None if images["depth"] is None else images["depth"][i],
-        alpha=images["alpha"][i],
-        dominant_id=None if images["dominant_id"] is None else images["dominant_id"][i],
-        max_weight=images["max_weight"],
-    )
+    view_arguments = _view_arguments(T_camera_frame, intrinsics_px, background, images, i)
+    height, width = images["alpha"].shape[1:]
+    ranges, depths, blocks = index.candidates(view_arguments["pose"], intrinsics_px, width, height, _BLOCK_PX)
+    view.draw(*arrays, ranges=ranges, depths=depths, blocks=blocks, **view_arguments)
 
 
 def _check_index(index: ChunkIndex, arrays: tuple[np.ndarray, ...]) -> None:
@@ -132,27 +117,32 @@ def forward(
 
     Pixels are drawn only if ``looked_at`` (H, W) is not 0 somewhere within reach of the SSIM window.
     """
-    height, width = images["alpha"].shape[1:]
-    pose = np.ascontiguousarray(T_camera_frame[:3], dtype=np.float64)
+    view_arguments = _view_arguments(T_camera_frame, intrinsics_px, background, images, i)
     ranges = None
     if index is not None:
         _check_index(index, arrays)
-        ranges = index.visible_ranges(pose, intrinsics_px, width, height)
-    view.forward(
-        *arrays,
-        pose=pose,
-        intrinsics=np.ascontiguousarray(intrinsics_px, dtype=np.float64),
-        width=width,
-        height=height,
-        ranges=ranges,
-        background=background,
-        colour=images["colour"][i],
-        depth=None if images["depth"] is None else images["depth"][i],
-        alpha=images["alpha"][i],
-        dominant_id=None if images["dominant_id"] is None else images["dominant_id"][i],
-        max_weight=images["max_weight"],
-        looked_at=looked_at,
-    )
+        height, width = images["alpha"].shape[1:]
+        ranges = index.visible_ranges(view_arguments["pose"], intrinsics_px, width, height)
+    view.forward(*arrays, ranges=ranges, looked_at=looked_at, **view_arguments)
+
+
+def _view_arguments(
+    T_camera_frame: np.ndarray, intrinsics_px: np.ndarray, background: np.ndarray, images: dict[str, Any], i: int
+) -> dict[str, Any]:
+    """Return the camera and the outputs of view ``i``, as the kernel names them."""
+    height, width = images["alpha"].shape[1:]
+    return {
+        "pose": np.ascontiguousarray(T_camera_frame[:3], dtype=np.float64),
+        "intrinsics": np.ascontiguousarray(intrinsics_px, dtype=np.float64),
+        "width": width,
+        "height": height,
+        "background": background,
+        "colour": images["colour"][i],
+        "depth": None if images["depth"] is None else images["depth"][i],
+        "alpha": images["alpha"][i],
+        "dominant_id": None if images["dominant_id"] is None else images["dominant_id"][i],
+        "max_weight": images["max_weight"],
+    }
 
 
 set_num_threads()
