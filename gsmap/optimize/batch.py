@@ -81,7 +81,8 @@ def _robust(m: Measurements, terms: PriorTerms, gate: float, params: Params) -> 
     """Solve robustly for the poses and the accepted edges, doubtful edges included."""
     doubtful = find_doubtful(m, params.max_look_alike)
     state, cycles = _grown_from(m, ~doubtful, terms, gate, params)
-    if (m.look_alike > 0).any() and not state.accepted.all():
+    is_judged = (m.look_alike > 0) | (m.disagreement > 0)  # the latter alone by older versions of registration
+    if is_judged.any() and not state.accepted.all():
         stricter = find_doubtful_in_map(m, state, doubtful, gate, params)
         if (stricter & ~doubtful).any():
             doubtful = stricter

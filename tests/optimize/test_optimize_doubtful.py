@@ -169,6 +169,17 @@ def test_where_doubt_begins_is_told_by_the_map():
 
 
 @pytest.mark.guards("answers")
+def test_edges_that_older_versions_registered_are_ranked_by_disagreement():
+    street, unknown = Street(), float("nan")
+    right = [replace(e, look_alike=unknown, disagreement=0.05) for e in street.right]
+    wrong = [replace(e, look_alike=unknown, disagreement=0.2) for e in street.wrong]
+    answer = optimize(street.ids, right + wrong, params=QUICK)
+    assert uses(answer, wrong) == {"unused"}
+    assert uses(answer, right) == {"tentative"}
+    assert components(answer) == [street.ids]
+
+
+@pytest.mark.guards("answers")
 def test_the_bar_divides_what_agrees_from_what_is_contradicted():
     rng = np.random.default_rng(0)
     low, high = (middle * np.exp(rng.normal(0, 0.2, 4000)) for middle in (0.05, 0.15))
