@@ -27,7 +27,7 @@ from gsmap.types.progress import Progress, silent
 from gsmap.types.scene import SCALE_POLICIES
 from gsmap.types.views import PointCloud, SceneContext
 
-VERSION = 6
+VERSION = 7
 _FEW_NODES = 20  # a scene gets a note if none of its layers has this many nodes
 
 

@@ -22,7 +22,7 @@ from gsmap.render.fitter import FitOptions, LearningRates
 from gsmap.settings.ranges import require_range
 from gsmap.types import Cameras, Gaussians
 
-VERSION = 5
+VERSION = 6
 """Raised whenever the same tiles and cameras give other levels; all levels are then made again."""
 
 _SCREEN_PX = 16.0  # default screen-space error of viewers of 3D Tiles, above which they refine

@@ -13,7 +13,7 @@ from gsmap.register.refinement import refiner_for
 from gsmap.types.plain import plain
 
 VERSION = 19
-PREPARE_VERSION = 1
+PREPARE_VERSION = 2
 
 _RENDER_BACKEND = "native"  # all renders of this room use it
 
