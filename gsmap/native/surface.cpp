@@ -475,7 +475,7 @@ void bind_surface(nb::module_ &m) {
             const std::size_t n = points.shape(0);
             if (values.shape(0) != n) throw std::invalid_argument("points need three values each");
             if (k < 2 || k > 20 || n <= std::size_t(k) || n > std::size_t(1) << 30)
-                throw std::invalid_argument("a point is held against 2 to 20 others");
+                throw std::invalid_argument("the number of neighbours must be 2 to 20, and less than the number of points");
             for (std::size_t i = 0; i < 3 * n; ++i)
                 if (!std::isfinite(points.data()[i])) throw std::invalid_argument("points must be finite");
             Many<double> far(n), second(n);

@@ -30,7 +30,7 @@ def features(similarity: float, free_space_violation: float) -> np.ndarray:
 
 
 def look_alike_probability(evidence: PoseEvidence, similarity: float) -> float:
-    """Return the probability that an aligned pair shows two places; NaN where nothing tells.
+    """Return the probability that an aligned pair shows two places; NaN if neither piece is known.
 
     Args:
         evidence: the evidence under the pose.

@@ -30,8 +30,8 @@ class Edge:
         log_odds_wrong: natural log-odds that the pose is wrong, by the evidence of registration and up to a constant
             that all edges share (`gsmap.optimize.edge_likelihood`); NaN where that is not known.
         duplicate: both scenes were made from one capture, so each repeats the measurements of the other.
-        look_alike: the probability that both scenes show two places that look alike, rather than one; NaN where
-            nothing tells.
+        look_alike: the probability that both scenes show two places that look alike, rather than one; NaN if
+            unknown.
     """
 
     target: str

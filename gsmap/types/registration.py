@@ -119,7 +119,7 @@ class Registration(RegisteredPose):
             ``similarity``: Fisher's transform of the correlation of the colours of both surfaces, cell by cell; NaN
             where they have too little in common.
             ``look_alike``: the probability that the pair shows two places that look alike, as ``probability`` takes
-            into account; NaN where nothing tells.
+            into account; NaN if neither ``similarity`` nor ``free_space_violation`` is known.
             ``disagreement``: of the surface that both saw, as area, the share that is not the same in both: one looked
             through it, or shows another pattern on it; NaN without cameras.
             ``seen_m2``: that surface, in square metres.
