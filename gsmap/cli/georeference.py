@@ -94,8 +94,8 @@ def command(
     Example: `gsmap georeference site.gsmap --crs EPSG:25832 --gcp gcp_list.txt --check P4,P7`
     """
     from gsmap.errors import ConfigError
-    from gsmap.map.photo_poses import photo_localizer
-    from gsmap.map.stages.georeference import Request
+    from gsmap.map.localization.photo_poses import photo_localizer
+    from gsmap.map.world.georeference import Request
 
     given = any(one is not None for one in (crs, gcp, exif, scale_bar, check))
     if remove and given:

@@ -114,8 +114,8 @@ def command(
     Example: `gsmap localize site.gsmap phone.jpg`
     """
     from gsmap.errors import ConfigError
-    from gsmap.map.small_map import is_small
-    from gsmap.map.small_map_localization import localize_small
+    from gsmap.map.small_map.export import is_small
+    from gsmap.map.small_map.localize import localize_small
     from gsmap.settings import parse
 
     if is_small(map):

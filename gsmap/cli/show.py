@@ -91,7 +91,7 @@ def command(
 
 def _report(m: Map, thing: str) -> SceneReport | PairReport | ChangeDetail | HistoryReport:
     from gsmap.errors import NotFoundError
-    from gsmap.map.changes import change_number
+    from gsmap.map.changes.rows import change_number
     from gsmap.store.objects import number_of
 
     # A scene name may contain a colon, or look like a change; the id of a scene may begin like a change.

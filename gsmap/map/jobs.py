@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from gsmap import localize as localizing
     from gsmap import register as registering
     from gsmap.export import PlannedTile
-    from gsmap.map.static_filter import DynamicContent
+    from gsmap.map.objects.static_filter import DynamicContent
     from gsmap.merge.reference_view_cache import ReferenceViewCache
     from gsmap.register import SceneView
     from gsmap.types.merging import UnchangedPlace
@@ -234,7 +234,7 @@ def _left_out(path: str, scene_id: str, passing: DynamicContent | None) -> np.nd
 @lru_cache(maxsize=8)
 def _without(path: str, scene_id: str, passing: DynamicContent) -> np.ndarray:
     """Return the rows of dynamic content; the answer is cached, as neighbouring tiles need the same scenes."""
-    from gsmap.map import static_filter
+    from gsmap.map.objects import static_filter
 
     return static_filter.dynamic_rows(_store(path), scene_id, passing)
 

@@ -31,11 +31,11 @@ from gsmap.types.scene import SceneEdits
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-    from gsmap.map.objects import MapObjects
-    from gsmap.map.photo_poses import LocalizePhotos
+    from gsmap.map.localization.photo_poses import LocalizePhotos
+    from gsmap.map.objects.map_objects import MapObjects
     from gsmap.map.settings import Settings
-    from gsmap.map.stages.georeference import Request
     from gsmap.map.stages.register import Pairs
+    from gsmap.map.world.georeference import Request
     from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
     from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport
     from gsmap.types.rows.evaluation import EvaluationReport
@@ -352,11 +352,11 @@ class Map(AbstractContextManager["Map"]):
         return self._review(what, "withdraw" if withdraw else "reject", note)
 
     def _review(self, what: str, review: str, note: str) -> EdgeRow | ChangeRow:
-        from gsmap.map import changes
+        from gsmap.map.changes import rows
 
-        if (number := changes.change_number(what)) is not None:
+        if (number := rows.change_number(what)) is not None:
             self.store.changes.review(number, review, note)
-            return changes.change_row(self.store, number)
+            return rows.change_row(self.store, number)
         a, b = self._pair(what)
         self.store.registrations.review(a.id, b.id, review, note)
         return reports.edge_row(self.store, a, b)
@@ -419,7 +419,7 @@ class Map(AbstractContextManager["Map"]):
 
     def remove_prior(self, scene: str) -> None:
         """Remove the surveyed world position of a scene or, without one, its pose prior."""
-        from gsmap.map.stages.georeference import forget_position
+        from gsmap.map.world.georeference import forget_position
 
         if not forget_position(self.store, scene):
             self.store.priors.remove(scene)
@@ -453,8 +453,8 @@ class Map(AbstractContextManager["Map"]):
             NotFoundError: the map has no poses yet, or no such scene.
             InputError: the dates do not order the two given captures.
         """
-        from gsmap.map.changes import changes_report, filter_by_date
-        from gsmap.map.stages.change import compare, plan_comparisons
+        from gsmap.map.changes.compare import compare, plan_comparisons
+        from gsmap.map.changes.rows import changes_report, filter_by_date
 
         asked = plan_comparisons(self.store, self.settings, None if pair is None else self._pair(pair))
         asked = filter_by_date(asked, since, between, as_of)
@@ -464,7 +464,7 @@ class Map(AbstractContextManager["Map"]):
         report = changes_report(self.store, self.settings, asked, min_confidence=min_confidence)
         if pictures is None:
             return report
-        from gsmap.map.comparison_pictures import draw
+        from gsmap.map.pictures.comparison_pictures import draw
 
         files = draw(self.store, Path(pictures), report.changes, self._progress)
         return replace(report, changes=tuple(replace(row, picture=files.get(row.id)) for row in report.changes))
@@ -475,9 +475,9 @@ class Map(AbstractContextManager["Map"]):
         Raises:
             NotFoundError: no change is called so, or it is no longer found.
         """
-        from gsmap.map import changes
+        from gsmap.map.changes import rows
 
-        return changes.change_detail(self.store, changes.parse_change_id(name))
+        return rows.change_detail(self.store, rows.parse_change_id(name))
 
     def read_change(self, name: str) -> Change:
         """Return a change (``c12``) with its arrays: voxels in the map frame, and rows of the Gaussians of both
@@ -486,9 +486,9 @@ class Map(AbstractContextManager["Map"]):
         Raises:
             NotFoundError: no change is called so, it is no longer found, or has no place now.
         """
-        from gsmap.map import changes
+        from gsmap.map.changes import rows
 
-        return changes.change_arrays(self.store, changes.parse_change_id(name))
+        return rows.change_arrays(self.store, rows.parse_change_id(name))
 
     # --- objects -----------------------------------------------------------------------------------------------------
 
@@ -498,19 +498,19 @@ class Map(AbstractContextManager["Map"]):
         Raises:
             NotFoundError: the map has no poses yet.
         """
-        from gsmap.map.objects import compute_objects, objects_report
+        from gsmap.map.objects.map_objects import compute_objects, objects_report
 
         return objects_report(compute_objects(self.store, self.settings, self._progress))
 
     def graph(self) -> Any:
         """Return the objects as a `networkx.MultiDiGraph` (see `gsmap.objects.object_graph`)."""
-        from gsmap.map.objects import as_networkx, compute_objects
+        from gsmap.map.objects.map_objects import as_networkx, compute_objects
 
         return as_networkx(compute_objects(self.store, self.settings, self._progress))
 
     def write_graph(self, out: str | os.PathLike[str], format: str = "json") -> ObjectsReport:
         """Write the objects as ``json`` or ``graphml``; after an error, no partial file remains."""
-        from gsmap.map.objects import compute_objects, objects_report, write_graph
+        from gsmap.map.objects.map_objects import compute_objects, objects_report, write_graph
 
         known = compute_objects(self.store, self.settings, self._progress)
         write_graph(known, out, format, self.store.id)
@@ -527,7 +527,7 @@ class Map(AbstractContextManager["Map"]):
             ConfigError: not one place.
             NotFoundError: no such object, or the map has no poses yet.
         """
-        from gsmap.map.objects import compute_objects, history_report
+        from gsmap.map.objects.map_objects import compute_objects, history_report
 
         return history_report(compute_objects(self.store, self.settings, self._progress), place, box)
 
@@ -561,7 +561,7 @@ class Map(AbstractContextManager["Map"]):
             NotFoundError: no such object.
             InputError: a name that is taken, or two that a capture shows apart; nothing is written.
         """
-        from gsmap.map.objects import edit_object
+        from gsmap.map.objects.map_objects import edit_object
 
         words = {"name": name, "label": label, "note": note, "same_as": same_as}
         return edit_object(self.store, self.settings, ref, self._progress, author=author, **words)
@@ -608,7 +608,7 @@ class Map(AbstractContextManager["Map"]):
             InputError: a file is neither a picture nor a scan.
             ConfigError: what is said of the lens or the place makes no sense.
         """
-        from gsmap.map.photo_localization import PhotoOptions, localize_files
+        from gsmap.map.localization.photo_localization import PhotoOptions, localize_files
 
         with announce_work(self.store, "localize"):
             return localize_files(
@@ -651,7 +651,7 @@ class Map(AbstractContextManager["Map"]):
             NotFoundError: no poses yet, or no such scene, node, object, or thing at the point.
             ConfigError: not one thing to look for, or words or a picture that the embedder cannot read.
         """
-        from gsmap.map.place_search import Request, find_places, with_pictures
+        from gsmap.map.find.place_search import Request, find_places, with_pictures
 
         request = Request(text, picture, like, at, top)
         report, boxes = find_places(self.store, request, self.settings, self._progress)
@@ -686,7 +686,7 @@ class Map(AbstractContextManager["Map"]):
             NotFoundError: no such file, or the map has no poses yet.
             InputError, ConfigError, MissingDependencyError: see `gsmap.formats.scans`.
         """
-        from gsmap.map.stages.localize_scan import Request, localize_scan
+        from gsmap.map.localization.localize_scan import Request, localize_scan
 
         request = Request(Path(file), intrinsics, colour, depth_scale, scale, near)
         return localize_scan(self.store, request, self.settings, self._progress)
@@ -801,7 +801,7 @@ class Map(AbstractContextManager["Map"]):
             MissingDependencyError: laspy or ezdxf is not installed.
         """
         from gsmap.map.stages.export import Request
-        from gsmap.map.stages.survey_export import SurveyOptions, export_survey
+        from gsmap.map.world.survey_export import SurveyOptions, export_survey
         from gsmap.types.rows.exports import ExportReport
 
         request = Request(
@@ -828,8 +828,8 @@ class Map(AbstractContextManager["Map"]):
 
     def static_content(self) -> tuple[MapObjects, tuple[str, ...]]:
         """Compare all visits, and return the objects of the map with notes on visits that are left out."""
-        from gsmap.map.objects import compute_objects
-        from gsmap.map.stages.change import compare, missing_comparisons, plan_comparisons
+        from gsmap.map.changes.compare import compare, missing_comparisons, plan_comparisons
+        from gsmap.map.objects.map_objects import compute_objects
 
         asked = plan_comparisons(self.store, self.settings)
         told = asked.notes
@@ -851,7 +851,7 @@ class Map(AbstractContextManager["Map"]):
             ConfigError: so few bytes that hardly a photograph would be found; how many it takes is said.
             NotFoundError: the map has no poses yet.
         """
-        from gsmap.map.small_map import export_small
+        from gsmap.map.small_map.export import export_small
 
         known = self.static_content()[0] if static else None
         with announce_work(self.store, "export"):
@@ -977,7 +977,7 @@ class Map(AbstractContextManager["Map"]):
         report = explain_pair(self.store, self.settings, *scenes)
         if pictures is None:
             return report
-        from gsmap.map.comparison_pictures import draw_pair
+        from gsmap.map.pictures.comparison_pictures import draw_pair
 
         return replace(report, picture=draw_pair(self.store, Path(pictures), *scenes))
 
@@ -1025,9 +1025,9 @@ class Map(AbstractContextManager["Map"]):
 
         Raises:
             ConfigError: tiles or a network without photographs to compare with, or bars that are not positive.
-            NotFoundError, InputError: see `gsmap.map.evaluation`.
+            NotFoundError, InputError: see `gsmap.map.evaluation.evaluate`.
         """
-        from gsmap.map import evaluation
+        from gsmap.map.evaluation import evaluate
 
         if images is None and (tiles is not None or lpips is not None):
             raise ConfigError(
@@ -1040,10 +1040,10 @@ class Map(AbstractContextManager["Map"]):
             params = replace(params, max_rte_m=max_rte_m)
         if truth_sigma is not None:
             params = replace(params, truth_sigma_deg=truth_sigma[0], truth_sigma_m=truth_sigma[1])
-        report = evaluation.poses(self.store, truth, params, self.metres())
+        report = evaluate.poses(self.store, truth, params, self.metres())
         if images is None:
             return report
-        rows = evaluation.images(
+        rows = evaluate.images(
             self.store,
             images,
             lambda f, text: self._progress("evaluate", f, text),
@@ -1065,8 +1065,8 @@ class Map(AbstractContextManager["Map"]):
         Raises:
             ConfigError: the port is taken, the page was not built, or that folder holds no 3D Tiles of this map.
         """
-        from gsmap.map.page_actions import actions_of
-        from gsmap.map.page_source import MapPageSource, cache_folder
+        from gsmap.map.page.actions import actions_of
+        from gsmap.map.page.source import MapPageSource, cache_folder
         from gsmap.view import ViewServer
 
         settings = self._settings_to_look_by()
@@ -1088,7 +1088,7 @@ class Map(AbstractContextManager["Map"]):
             ConfigError: the folder holds something else, or a page of a gsmap that kept no list of its files; another
                 file lies where one has to go; the page was not built; or ``tiles`` are not this map's.
         """
-        from gsmap.map.page_export import write_site
+        from gsmap.map.page.export import write_site
 
         chosen = None if tiles is None else Path(tiles)
         return write_site(self.store, self._settings_to_look_by(), Path(folder), chosen, self._progress)
@@ -1105,7 +1105,7 @@ class Map(AbstractContextManager["Map"]):
             ConfigError: another file, or the page was not built.
             NotFoundError: no such folder.
         """
-        from gsmap.map.page_export import write_page
+        from gsmap.map.page.export import write_page
 
         return write_page(self.store, self._settings_to_look_by(), Path(path), megabytes, self._progress)
 
@@ -1122,7 +1122,7 @@ class Map(AbstractContextManager["Map"]):
             ConfigError: another file, or no date.
             NotFoundError: no such folder.
         """
-        from gsmap.map.report_builder import write_report
+        from gsmap.map.report.builder import write_report
 
         return write_report(self.store, self._settings_to_look_by(), Path(path), since, pictures, self._progress)
 
@@ -1132,7 +1132,7 @@ class Map(AbstractContextManager["Map"]):
         Raises:
             NotFoundError: no pose was found.
         """
-        from gsmap.map.comparison_pictures import picture_of_pair, save_picture
+        from gsmap.map.pictures.comparison_pictures import picture_of_pair, save_picture
 
         a, b = self._pair(pair)
         if (picture := picture_of_pair(self.store, a.id, b.id)) is None:
@@ -1148,9 +1148,9 @@ class Map(AbstractContextManager["Map"]):
         Raises:
             NotFoundError: no such object.
         """
-        from gsmap.map.comparison_pictures import save_picture
-        from gsmap.map.object_pictures import ObjectPictures
-        from gsmap.map.objects import compute_objects
+        from gsmap.map.objects.map_objects import compute_objects
+        from gsmap.map.pictures.comparison_pictures import save_picture
+        from gsmap.map.pictures.object_pictures import ObjectPictures
 
         known = compute_objects(self.store, self.settings, self._progress)
         save_picture(ObjectPictures(self.store, known).draw(ref), path)
@@ -1161,7 +1161,7 @@ class Map(AbstractContextManager["Map"]):
         Raises:
             NotFoundError: no such change, or it has no place now.
         """
-        from gsmap.map.comparison_pictures import picture_of_change, save_picture
+        from gsmap.map.pictures.comparison_pictures import picture_of_change, save_picture
 
         row = self.show_change(name)
         if (picture := picture_of_change(self.store, row)) is None:
@@ -1172,7 +1172,7 @@ class Map(AbstractContextManager["Map"]):
 
     def draw_graph(self, ref: str, path: str | os.PathLike[str]) -> None:
         """Draw the scene graph over a render (``gsmap show MAP SCENE --picture``)."""
-        from gsmap.map.comparison_pictures import save_picture
+        from gsmap.map.pictures.comparison_pictures import save_picture
         from gsmap.view.graph_picture import draw_graph
 
         scene = self.store.scenes.get(ref)
@@ -1202,15 +1202,16 @@ class Map(AbstractContextManager["Map"]):
         MAP``).
 
         Args:
-            request: observations to store (`gsmap.map.stages.georeference.Request`); None to report only.
+            request: observations to store (`gsmap.map.world.georeference.Request`); None to report only.
             remove: names of observations to remove; an empty sequence removes all, with the CRS.
-            localise: localizes photos that are not cameras of a scene (`gsmap.map.photo_poses.photo_localizer`).
+            localise: localizes photos that are not cameras of a scene
+                (`gsmap.map.localization.photo_poses.photo_localizer`).
 
         Raises:
-            ConfigError, InputError, NotFoundError: see `gsmap.map.stages.georeference`; nothing is noted then.
+            ConfigError, InputError, NotFoundError: see `gsmap.map.world.georeference`; nothing is noted then.
         """
-        from gsmap.map.stages.georeference import georeference, take_back
         from gsmap.map.stages.optimize import is_solved, solve
+        from gsmap.map.world.georeference import georeference, take_back
 
         notes: tuple[str, ...] = ()
         if request is not None or remove is not None:
@@ -1233,7 +1234,7 @@ class Map(AbstractContextManager["Map"]):
             position: (3,) longitude or easting first, then latitude or northing, then height.
             sigma_m: horizontal and vertical standard deviations.
         """
-        from gsmap.map.stages.georeference import survey_position
+        from gsmap.map.world.georeference import survey_position
 
         survey_position(self.store, scene, position, crs, sigma_m, self.settings)
 
@@ -1245,7 +1246,7 @@ class Map(AbstractContextManager["Map"]):
             component: component of points given in the map, if it has several.
             crs: CRS of the returned world coordinates; default: the map's.
         """
-        from gsmap.map.distances import measure
+        from gsmap.map.world.distances import measure
 
         return measure(self.store, a, b, self.settings, component=component, crs=crs)
 
@@ -1277,7 +1278,7 @@ class Map(AbstractContextManager["Map"]):
 
     def photo_rows(self) -> list[PhotoRow]:
         """List the stored photos (``gsmap list MAP photos``), oldest first, with positions by the newest poses."""
-        from gsmap.map.photos import photo_rows
+        from gsmap.map.localization.photos import photo_rows
 
         return photo_rows(self.store)
 
@@ -1400,7 +1401,7 @@ class Map(AbstractContextManager["Map"]):
         Raises:
             ConfigError: no days and no budget; or the clock contradicts what is stored, and ``now`` is not given.
         """
-        from gsmap.map.stages.thin import Request, thin
+        from gsmap.map.thinning.thin import Request, thin
 
         with announce_work(self.store, "thin"):
             return thin(self.store, Request(keep_days, budget_bytes, dry_run, now), self.settings, self._progress)

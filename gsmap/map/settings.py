@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     )
     from gsmap.evaluate import map_errors
     from gsmap.localize import scan
-    from gsmap.map import visits
+    from gsmap.map.changes import visits
 
 _log = logging.getLogger("gsmap.settings")
 
@@ -127,7 +127,7 @@ class Settings:
     thin: thin.Params = field(default=_params_of("gsmap.thin"))
     merge: merge.Params = field(default=_params_of("gsmap.merge"))
     export: export.Params = field(default=_params_of("gsmap.export"))
-    visits: visits.Params = field(default=_params_of("gsmap.map.visits"))
+    visits: visits.Params = field(default=_params_of("gsmap.map.changes.visits"))
     change: change.Params = field(default=_params_of("gsmap.change"))
     objects: objects.Params = field(default=_params_of("gsmap.objects"))
     localize: localize.Params = field(default=_params_of("gsmap.localize"))

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from gsmap.map.changes import num_open
+from gsmap.map.changes.rows import num_open
 from gsmap.map.metric_scales import map_metres
 from gsmap.map.reports.one_pair import is_one_pair, scenes_by_one_pair
 from gsmap.map.settings import Settings

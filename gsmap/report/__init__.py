@@ -1,7 +1,7 @@
 """Report of a map on one self-contained HTML page: scenes, edges, uncertainty, changes and open tasks.
 
 `page` formats a `Report` as one HTML file without scripts or external links; its Content-Security-Policy lets a
-browser load nothing. `gsmap.map.report_builder` collects the content.
+browser load nothing. `gsmap.map.report.builder` collects the content.
 """
 
 from gsmap.report.content import (

@@ -13,7 +13,7 @@ from gsmap.cli.edge import read_pose
 from gsmap.errors import ConfigError, InputError
 from gsmap.export import streamed_sog, tileset
 from gsmap.export.manifest import Manifest
-from gsmap.map.evaluation import _read_truth
+from gsmap.map.evaluation.evaluate import _read_truth
 from gsmap.map.settings import map_settings
 from gsmap.settings import parse
 

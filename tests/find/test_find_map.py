@@ -13,9 +13,9 @@ from raising import raises
 import gsmap
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.map import Map
-from gsmap.map.comparison_pictures import PictureFolder
-from gsmap.map.objects import load_objects
-from gsmap.map.stages import component_objects
+from gsmap.map.objects import component_objects
+from gsmap.map.objects.map_objects import load_objects
+from gsmap.map.pictures.comparison_pictures import PictureFolder
 from gsmap.types.localized_photo import LocalizedPhoto, PhotoObjectObservation
 from gsmap.types.rows.find import FindHit, FindReport
 from tools.make.tiny_encoder import image_encoder

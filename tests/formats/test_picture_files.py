@@ -25,7 +25,7 @@ from gsmap.formats.scans import read_depth
 from gsmap.ingest import dates
 from gsmap.localize import read_photo
 from gsmap.localize.photos import read_mask
-from gsmap.map import photo_poses
+from gsmap.map.localization import photo_poses
 from gsmap.world import exif
 
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 32\n%%EndComments\nshowpage\n%%EOF\n"

@@ -22,7 +22,7 @@ from hostile_world import CASES, MAX_MEMORY, VERBS, Case, World, everything_in
 import gsmap.map
 from gsmap.cli import app as command_line
 from gsmap.errors import GsmapError
-from gsmap.map.page_source import MapPageSource
+from gsmap.map.page.source import MapPageSource
 from gsmap.texts import escaped
 from gsmap.view.content import ServerState, summary
 

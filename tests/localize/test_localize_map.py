@@ -21,11 +21,11 @@ import gsmap.map
 from gsmap.cli.app import run
 from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError, ReadOnlyError, StoreError
 from gsmap.localize import Lens, index_recipe, photo_in_memory, read_photo
-from gsmap.map.page_source import view_of
+from gsmap.map.localization.localize import Localizer, feature_keys
+from gsmap.map.page.source import view_of
 from gsmap.map.settings import settings_of
-from gsmap.map.small_map import SmallLocalizer
-from gsmap.map.small_map_localization import localize_small
-from gsmap.map.stages.localize import Localizer, feature_keys
+from gsmap.map.small_map.export import SmallLocalizer
+from gsmap.map.small_map.localize import localize_small
 from gsmap.store import Store
 from gsmap.types import Sim3
 
@@ -105,7 +105,7 @@ def test_features_are_made_once(made, monkeypatch) -> None:
     def never(*arguments):
         raise AssertionError("features were made again")
 
-    monkeypatch.setattr("gsmap.map.stages.localize.features_of_scene", never)
+    monkeypatch.setattr("gsmap.map.localization.localize.features_of_scene", never)
     with gsmap.map.open(folder / "m.gsmap") as m:
         again = m.localize(folder / "photo.png", intrinsics=lens)
     assert np.array_equal(again.results[0].T_map_camera, report.results[0].T_map_camera)
@@ -452,7 +452,7 @@ def test_a_scene_whose_features_could_not_be_made_stays_out_of_the_index(made, w
         other = world.capture.gaussians
         m.ingest(other[np.arange(0, len(other), 2)], cameras=world.capture.cameras, name="again")
         m.optimize()
-        monkeypatch.setattr("gsmap.map.stages.localize.ensure", lambda *arguments: None)
+        monkeypatch.setattr("gsmap.map.localization.localize.ensure", lambda *arguments: None)
         assert m.localize(folder / "photo.png", intrinsics=lens).results[0].scenes == ("room",)
 
 

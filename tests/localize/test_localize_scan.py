@@ -14,7 +14,7 @@ import gsmap
 from gsmap import formats
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.geometry.rotations import angle_between
-from gsmap.map.stages.localize_scan import _near
+from gsmap.map.localization.localize_scan import _near
 from gsmap.types.rows.localize_scan import ScanRow
 
 

@@ -10,7 +10,7 @@ from gsmap.errors import ConfigError, InputError
 from gsmap.geometry.camera_models import camera_model, pinhole_views, rays_of
 from gsmap.localize import combine_faces, read_photo
 from gsmap.localize.photos import Lens, make_photo
-from gsmap.map.photo_localization import parse_lens
+from gsmap.map.localization.photo_localization import parse_lens
 from gsmap.types.localization import LocalizationResult, Photo
 
 

@@ -13,7 +13,7 @@ from raising import raises
 
 from gsmap.errors import CorruptError
 from gsmap.localize import packed_features, packed_gaussians
-from gsmap.map.small_map import SmallLocalizer
+from gsmap.map.small_map.export import SmallLocalizer
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.localization import SceneFeatures
 

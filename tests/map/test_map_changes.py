@@ -19,9 +19,9 @@ from gsmap.export import PlannedTile
 from gsmap.geometry.boxes import moved_box
 from gsmap.geometry.rotations import exp_so3
 from gsmap.map import Map
+from gsmap.map.changes.visits import Params, Visit, has_moved, pairs_of_visits
 from gsmap.map.rejected_changes import places_near, rejected_places
 from gsmap.map.stages.export import Request, plan
-from gsmap.map.visits import Params, Visit, has_moved, pairs_of_visits
 from gsmap.types import Cameras, Change, ChangeReport, Gaussians, PosedScene, PoseGraph, ScenePose, Sim3
 from gsmap.types.metric_scale import MetricScale
 

@@ -165,9 +165,9 @@ def test_a_scene_costs_its_neighbours_only(made: Path, monkeypatch: pytest.Monke
         opened: list[str] = []
         whole = gsmap.formats.read
         monkeypatch.setattr("gsmap.formats.read", lambda path: opened.append(Path(path).name) or whole(path))
-        from gsmap.map import evaluation
+        from gsmap.map.evaluation import evaluate
 
-        evaluation.images(m.store, made / "images", lambda f, text: None, tiles=made / "tiles")
+        evaluate.images(m.store, made / "images", lambda f, text: None, tiles=made / "tiles")
     assert sorted(read) == ["a"] * 3 + ["b"] * 3 + ["far"] * 2  # alone, and in each union that it is near
     assert len(opened) <= 2 * len(set(opened))
     assert set(opened) == {path.name for path in (made / "tiles").rglob("*.ply")}

@@ -12,7 +12,7 @@ from gsmap.evaluate.renders import compare_renders, find_images
 from gsmap.formats import gcp_list
 from gsmap.geometry.camera_models import camera_model, photo_pixels, pinhole_views, rays_of
 from gsmap.geometry.sh import SH_C0
-from gsmap.map.stages.georeference import Request
+from gsmap.map.world.georeference import Request
 from gsmap.types import Cameras, Gaussians
 from gsmap.world.frame import from_frame
 from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site

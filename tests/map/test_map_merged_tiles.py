@@ -12,7 +12,7 @@ import pytest
 import gsmap.map
 from gsmap import formats
 from gsmap.map import Map, merged_tiles
-from gsmap.map.evaluation import _Export
+from gsmap.map.evaluation.evaluate import _Export
 from gsmap.types import Cameras, Gaussians, PoseGraph, ScenePose, Sim3
 
 

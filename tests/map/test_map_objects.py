@@ -24,12 +24,12 @@ from gsmap.errors import ConfigError, DiskFullError, InputError, NotFoundError, 
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import Map
-from gsmap.map.objects import _numbered, compute_objects, load_objects
-from gsmap.map.page_source import MapPageSource
-from gsmap.map.small_map import SmallLocalizer
-from gsmap.map.stages.change import standing_comparisons
-from gsmap.map.stages.objects import ComponentObjects
-from gsmap.map.static_filter import find_dynamic_content, is_dynamic
+from gsmap.map.changes.compare import standing_comparisons
+from gsmap.map.objects.associate import ComponentObjects
+from gsmap.map.objects.map_objects import _numbered, compute_objects, load_objects
+from gsmap.map.objects.static_filter import find_dynamic_content, is_dynamic
+from gsmap.map.page.source import MapPageSource
+from gsmap.map.small_map.export import SmallLocalizer
 from gsmap.methods import RecipeKey
 from gsmap.store import Store, schema
 from gsmap.store.graphs import Graphs
@@ -413,11 +413,11 @@ def test_the_page_shows_a_label_that_was_written_while_objects_were_read(
 
     def write_after_reading(*args: object) -> object:
         found = read(*args)
-        monkeypatch.setattr("gsmap.map.page_source.compute_objects", read)
+        monkeypatch.setattr("gsmap.map.page.source.compute_objects", read)
         site.store.objects.edit(number, label="meanwhile")
         return found
 
-    monkeypatch.setattr("gsmap.map.page_source.compute_objects", write_after_reading)
+    monkeypatch.setattr("gsmap.map.page.source.compute_objects", write_after_reading)
     try:
         page.graph()
         assert {row["id"]: row["label"] for row in page.graph()["objects"]}[f"o{number}"] == "meanwhile"

@@ -14,8 +14,8 @@ import gsmap
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats import gcp_list
 from gsmap.map import Map
-from gsmap.map.photo_names import match_photos, rows_of_photo
-from gsmap.map.stages.georeference import Request
+from gsmap.map.world.georeference import Request
+from gsmap.map.world.photo_names import match_photos, rows_of_photo
 from gsmap.optimize.survey_system import System
 from gsmap.types import Cameras
 from gsmap.world.frame import from_frame

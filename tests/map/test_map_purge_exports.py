@@ -17,8 +17,8 @@ import gsmap.map
 from gsmap.durable import remove_staged, staged_folder, write_owned, write_text_output
 from gsmap.errors import GsmapError
 from gsmap.map import Map
-from gsmap.map.comparison_pictures import note_target
-from gsmap.map.small_map import SmallLocalizer
+from gsmap.map.pictures.comparison_pictures import note_target
+from gsmap.map.small_map.export import SmallLocalizer
 from gsmap.store import purging
 from gsmap.types import Cameras, PoseGraph, ScenePose, Sim3
 from gsmap.view.tree_cache import TreeCache

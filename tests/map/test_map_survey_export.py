@@ -13,7 +13,7 @@ from pyproj import Transformer
 
 import gsmap
 from gsmap.errors import ConfigError, NotFoundError
-from gsmap.map.stages.georeference import Request
+from gsmap.map.world.georeference import Request
 from gsmap.world.frame import from_frame, to_frame
 from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site
 

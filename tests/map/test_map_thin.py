@@ -147,7 +147,7 @@ def set_clock(patch: pytest.MonkeyPatch, when: datetime) -> None:
         def now(cls, tz=None):
             return when
 
-    patch.setattr("gsmap.map.stages.thin.datetime", Clock)
+    patch.setattr("gsmap.map.thinning.thin.datetime", Clock)
 
 
 def test_a_clock_that_is_ahead_makes_no_capture_older(tmp_path, monkeypatch):

@@ -17,7 +17,7 @@ import gsmap
 from gsmap import formats
 from gsmap.errors import ConfigError, GsmapError, NotFoundError
 from gsmap.map import create
-from gsmap.map.page_source import MapPageSource, cache_folder, content_key
+from gsmap.map.page.source import MapPageSource, cache_folder, content_key
 from gsmap.types import Gaussians, Sim3
 from gsmap.view.built import built_page
 from gsmap.view.tree_cache import TreeCache

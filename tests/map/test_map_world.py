@@ -12,8 +12,8 @@ import pytest
 
 import gsmap
 from gsmap.errors import ConfigError, InputError, NotFoundError
-from gsmap.map.photo_poses import PhotoPose
-from gsmap.map.stages.georeference import Request
+from gsmap.map.localization.photo_poses import PhotoPose
+from gsmap.map.world.georeference import Request
 from gsmap.types.world import PositionFix
 from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site
 
@@ -399,7 +399,7 @@ def test_a_localised_photo_is_put_into_its_scene_s_frame(site: Site, tied: Path,
     from PIL import Image
 
     from gsmap.geometry.rotations import exp_so3
-    from gsmap.map.photo_poses import photo_localizer, photo_pose_of
+    from gsmap.map.localization.photo_poses import photo_localizer, photo_pose_of
     from gsmap.types import ScenePose, Sim3
 
     S = Sim3(exp_so3(np.array([0.1, 0.2, 0.3])), np.array([1.0, 2, 3]), 4.0)
@@ -473,7 +473,7 @@ def test_a_photo_that_cannot_be_placed_is_left_out(tied: Path, site: Site, tmp_p
     """Through `Map.localize` itself: noise is refused, and its points with it."""
     from PIL import Image
 
-    from gsmap.map.photo_poses import photo_localizer
+    from gsmap.map.localization.photo_poses import photo_localizer
 
     noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
     Image.fromarray(noise).save(tmp_path / "noise.jpg")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsmap.export.survey_files import pixel_size, polygons_of
-from gsmap.map.stages.survey_export import _below_ceiling, _walls
+from gsmap.map.world.survey_export import _below_ceiling, _walls
 from gsmap.types import Gaussians
 
 

@@ -182,7 +182,7 @@ def test_time_split_and_clip_are_drawn_and_come_back_by_the_address(opened):
 
 def test_the_page_as_files_shows_the_same_without_a_server(made, built, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr("gsmap.map.page_export.built_page", lambda: built)
+    monkeypatch.setattr("gsmap.map.page.export.built_page", lambda: built)
     with gsmap.open(made) as m:
         m.write_site(tmp_path / "site")
         m.write_page(tmp_path / "one.html")

@@ -21,7 +21,7 @@ import numpy as np
 
 import gsmap
 from gsmap.find import SimilarityModel
-from gsmap.map.objects import compute_objects
+from gsmap.map.objects.map_objects import compute_objects
 from tools.bench.find_scores import QUERIES, average_precisions, by_cosine, by_model, items_of, precision
 from tools.harness import argument_parser
 from tools.make import find_places

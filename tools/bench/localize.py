@@ -66,9 +66,9 @@ from gsmap.localize.refinement import ScaledPhoto
 from gsmap.localize.resection import retract_pose
 from gsmap.localize.retrieval import retrieve_views
 from gsmap.localize.vocabulary import Vocabulary, load_vocabulary
+from gsmap.map.localization.localize import Localizer
 from gsmap.map.progress_logging import log_progress
-from gsmap.map.small_map import SmallLocalizer, export_small
-from gsmap.map.stages.localize import Localizer
+from gsmap.map.small_map.export import SmallLocalizer, export_small
 from gsmap.render import render
 from gsmap.types import Cameras, Sim3
 from gsmap.types.localization import LocalizationResult, Photo, SceneFeatures

@@ -122,7 +122,7 @@ def _changes(path: str, folder: Path, part: int) -> str:
 
 
 def _features(path: str, folder: Path, part: int) -> str:
-    from gsmap.map.stages.localize import Localizer
+    from gsmap.map.localization.localize import Localizer
 
     with gsmap.map.open(path) as m:
         return f"{len(Localizer(m.store, m.settings, m._progress).placed)} captures"
@@ -167,12 +167,12 @@ def _imports() -> None:
     import gsmap.describe
     import gsmap.export
     import gsmap.localize
-    import gsmap.map.changes
-    import gsmap.map.photo_localization
-    import gsmap.map.stages.change
+    import gsmap.map.changes.compare
+    import gsmap.map.changes.rows
+    import gsmap.map.localization.localize
+    import gsmap.map.localization.photo_localization
     import gsmap.map.stages.export
     import gsmap.map.stages.ingest
-    import gsmap.map.stages.localize
     import gsmap.map.stages.register
     import gsmap.register  # noqa: F401
 

@@ -27,9 +27,9 @@ import numpy as np
 
 import gsmap.map
 from gsmap import formats
-from gsmap.map import static_filter
-from gsmap.map.stages.change import standing_comparisons
-from gsmap.map.static_filter import DynamicContent
+from gsmap.map.changes.compare import standing_comparisons
+from gsmap.map.objects import static_filter
+from gsmap.map.objects.static_filter import DynamicContent
 from gsmap.types import PoseGraph, ScenePose
 from tools.harness import argument_parser
 from tools.make.change_truth import Truth, owners

@@ -199,7 +199,7 @@ def trees(args: argparse.Namespace) -> None:
 
 def catalog(args: argparse.Namespace) -> None:
     from gsmap.map import create
-    from gsmap.map.page_source import MapPageSource
+    from gsmap.map.page.source import MapPageSource
     from gsmap.types import Cameras
 
     none = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 4)), np.zeros((0, 2)), (), True)
@@ -240,7 +240,7 @@ def fidelity(args: argparse.Namespace) -> None:
             '<!doctype html><html><head><link rel="icon" href="data:," /><link rel="stylesheet" href="style.css" />'
             '</head><body><canvas tabindex="0"></canvas><script type="module" src="page.js"></script></body></html>'
         )
-        from gsmap.map.page_source import MapPageSource, cache_folder
+        from gsmap.map.page.source import MapPageSource, cache_folder
 
         page_source = MapPageSource(m.store, m.settings)
         placed = [

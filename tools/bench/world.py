@@ -24,7 +24,7 @@ from gsmap.formats import gcp_list, tiles3d
 from gsmap.geometry.similarities import Similarities
 from gsmap.geometry.umeyama import umeyama
 from gsmap.map import Map
-from gsmap.map.stages.georeference import Request
+from gsmap.map.world.georeference import Request
 from gsmap.optimize import joint_covariance, optimize
 from gsmap.types import PoseGraph
 from gsmap.types.world import ControlPoint, Georeference, ImagePoint, Survey

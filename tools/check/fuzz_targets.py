@@ -28,7 +28,7 @@ from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.ingest import find_captures, find_date
 from gsmap.ingest.dates import date_in_name
 from gsmap.ingest.validate import validate
-from gsmap.map.evaluation import _read_truth
+from gsmap.map.evaluation.evaluate import _read_truth
 from gsmap.map.settings import map_settings, write_settings
 from gsmap.map.stages.register import read_pairs
 from gsmap.networks.file import refuse_external_data

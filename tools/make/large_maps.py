@@ -31,7 +31,7 @@ from gsmap.geometry.directions import rotation_to_z
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import exp
 from gsmap.map import Map
-from gsmap.map.page_source import MapPageSource
+from gsmap.map.page.source import MapPageSource
 from gsmap.map.scene_lookup import keys_of_lookups
 from gsmap.map.stages import describe, register
 from gsmap.methods import RecipeKey

@@ -22,15 +22,15 @@ from gsmap.export.pyramid import TreeLayout, is_stale, remove_tree_files
 from gsmap.export.streamed_sog import StreamedSog, write_streams
 from gsmap.export.tileset import Tiles3D, write_tilesets, write_whole_map
 from gsmap.geometry.transforms import transform_cameras
+from gsmap.map.changes.compare import standing_comparisons
 from gsmap.map.date_filter import end_of_date, is_until, undated_note
+from gsmap.map.georeferenced_components import GeoreferencedComponent, georeferenced_components, world_notes
 from gsmap.map.jobs import TileMaker
 from gsmap.map.metric_scales import map_metres, metre_notes
+from gsmap.map.objects.static_filter import DynamicContent, dynamic_notes, find_dynamic_content
 from gsmap.map.rejected_changes import places_near, rejected_places
 from gsmap.map.settings import Settings
 from gsmap.map.shared_jobs import note_interruption
-from gsmap.map.stages.change import standing_comparisons
-from gsmap.map.static_filter import DynamicContent, dynamic_notes, find_dynamic_content
-from gsmap.map.world import GeoreferencedComponent, georeferenced_components, world_notes
 from gsmap.merge import merger, photos_m, reach_m, recipe_key, uses_dates, with_prefer, with_steps
 from gsmap.merge.reference_view_cache import ReferenceViewCache
 from gsmap.methods import text_digest
@@ -44,7 +44,7 @@ from gsmap.types.plain import canonical, plain
 from gsmap.types.progress import Progress
 
 if TYPE_CHECKING:
-    from gsmap.map.objects import MapObjects
+    from gsmap.map.objects.map_objects import MapObjects
 
 _log = logging.getLogger("gsmap.export")
 
@@ -163,7 +163,7 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
         rejected = rejected_places(store.changes.current(), scenes, placed, metres)
     passing: dict[str, DynamicContent] = {}
     if request.static:
-        from gsmap.map.objects import load_objects
+        from gsmap.map.objects.map_objects import load_objects
 
         known = load_objects(store, settings) if known is None else known
         found = find_dynamic_content(store, known, standing_comparisons(store, settings))

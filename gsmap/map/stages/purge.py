@@ -26,11 +26,12 @@ from gsmap.export.pyramid import LEVELS_FOLDER, is_stale, remove_tree_files
 from gsmap.export.streamed_sog import StreamedSog
 from gsmap.export.tileset import Tiles3D
 from gsmap.export.write import leftovers
-from gsmap.map import merged_tiles, small_map
-from gsmap.map.comparison_pictures import FILE_NAME as PICTURES
-from gsmap.map.comparison_pictures import PictureFolder
-from gsmap.map.page_export import SITE, remove_site, site_files, site_owner
-from gsmap.map.page_source import cache_folder
+from gsmap.map import merged_tiles
+from gsmap.map.page.export import SITE, remove_site, site_files, site_owner
+from gsmap.map.page.source import cache_folder
+from gsmap.map.pictures.comparison_pictures import FILE_NAME as PICTURES
+from gsmap.map.pictures.comparison_pictures import PictureFolder
+from gsmap.map.small_map import export as small_map
 from gsmap.report import owner_of
 from gsmap.store import Store, purging
 from gsmap.store.purging import Purge

@@ -1,0 +1,1 @@
+"""Compare visits, and report changes."""

@@ -1,0 +1,191 @@
+"""Change stage: choose pairs of visits and compare the pairs that lack a current comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+
+from gsmap.change import recipe_key
+from gsmap.engine import run_jobs
+from gsmap.errors import InputError, NotFoundError
+from gsmap.geometry.metric_scale import in_metres
+from gsmap.map.changes.visits import Visit, has_moved, pairs_of_visits
+from gsmap.map.date_filter import NO_DATE, parse_moment
+from gsmap.map.jobs import compare_scenes
+from gsmap.map.metric_scales import metres_of_scenes
+from gsmap.map.settings import Settings
+from gsmap.map.shared_jobs import SharedJobs, note_interruption
+from gsmap.methods import RecipeKey
+from gsmap.store import Store
+from gsmap.store.change_rows import Comparison
+from gsmap.types import Scene
+from gsmap.types.progress import StageProgress
+
+_NAMED = 5  # scenes that a remark names
+
+
+@dataclass(frozen=True, eq=False)
+class ComparisonPlan:
+    """The comparisons that a map needs.
+
+    Args:
+        visits: dated scenes with a pose, by scene id.
+        pairs: (older, newer) scene ids.
+        notes: scenes that are left out, with the reason.
+    """
+
+    visits: dict[str, Visit]
+    pairs: list[tuple[str, str]]
+    notes: tuple[str, ...]
+
+
+def plan_comparisons(store: Store, settings: Settings, pair: tuple[Scene, Scene] | None = None) -> ComparisonPlan:
+    """Choose the pairs of visits to compare (`gsmap.map.changes.visits`), or one given pair, without reading arrays.
+
+    Raises:
+        NotFoundError: the map has no poses yet, or a scene that is named has no place.
+        InputError: of two scenes that are named, which one is newer is not known, or they share no frame.
+    """
+    graph = store.revisions.get()
+    if graph is None:
+        raise NotFoundError(
+            "the map has no poses yet, so that nothing can be compared: run gsmap update first", code="no_poses"
+        )
+    scenes = store.scenes.list() if pair is None else list(pair)
+    undated = [scene.name for scene in scenes if scene.captured_at is None]
+    metres = metres_of_scenes(store, graph)
+    visits = {
+        scene.id: Visit(
+            scene.id,
+            parse_moment(scene.captured_at),
+            pose.component,
+            in_metres(pose.S_map_scene, metres[scene.id]),
+            scene.bounds,
+            metres[scene.id],
+        )
+        for scene in scenes
+        if scene.captured_at is not None and (pose := graph.poses.get(scene.id)) is not None
+    }
+    if pair is None:
+        unplaced = [scene.name for scene in scenes if scene.id not in graph.poses]
+        notes = [f"{_names(undated)} no date: which one is newer is not known ({NO_DATE})"] if undated else []
+        if unplaced:
+            notes.append(f"{_names(unplaced)} no place in the map yet: run gsmap update")
+        return ComparisonPlan(visits, pairs_of_visits(list(visits.values()), settings.visits), tuple(notes))
+    for scene in pair:
+        if scene.id not in graph.poses:
+            raise NotFoundError(
+                f"scene {scene.name} has no place in the map yet: run gsmap update first", code="scene_unplaced"
+            )
+    if undated:
+        raise InputError(
+            f"{_names(undated)} no date: which one is newer is not known ({NO_DATE})", code="order_unknown"
+        )
+    older, newer = sorted((visits[scene.id] for scene in pair), key=lambda visit: visit.when)
+    if older.when == newer.when:
+        raise InputError(
+            f"{pair[0].name} and {pair[1].name} have the same date, so it is unknown which one is newer",
+            code="order_unknown",
+        )
+    if older.component != newer.component:
+        raise InputError(
+            f"{pair[0].name} and {pair[1].name} lie in two components, so their relative pose is unknown",
+            code="different_components",
+        )
+    return ComparisonPlan(visits, [(older.scene, newer.scene)], ())
+
+
+def missing_comparisons(store: Store, asked: ComparisonPlan, settings: Settings) -> list[tuple[str, str]]:
+    """Return the pairs without a current comparison: new pairs, and pairs compared by another recipe or at other
+    poses.
+    """
+    done = {(one.older, one.newer) for one in _valid(store.changes.current(), asked, settings)}
+    return [pair for pair in asked.pairs if pair not in done]
+
+
+def standing_comparisons(store: Store, settings: Settings) -> list[Comparison]:
+    """Return the comparisons of visits that hold at the present poses, by whatever recipe, also of pairs that a person
+    asked for: exports may act on their changes."""
+    visits = plan_comparisons(store, settings).visits
+    dated = (one for one in store.changes.current() if one.older in visits and one.newer in visits)
+    return [
+        one
+        for one in dated
+        if visits[one.older].component == visits[one.newer].component
+        and visits[one.older].when < visits[one.newer].when
+        and _stands(one, visits)
+    ]
+
+
+def compare(
+    store: Store, asked: ComparisonPlan, settings: Settings, progress: StageProgress, *, verify: bool = False
+) -> int:
+    """Compare the pairs that lack a current comparison; return their number.
+
+    Args:
+        verify: also read stored comparisons and repeat damaged ones.
+    """
+    keys = {_key(settings, asked, *pair).digest: pair for pair in asked.pairs}
+
+    def done(wanted_keys: Collection[str]) -> set[str]:
+        valid = {one.key: one.number for one in _valid(store.changes.current(), asked, settings)}
+        there = {key for key in wanted_keys if key in valid}
+        damaged = store.changes.damaged(valid[key] for key in there) if verify else set()
+        return {key for key in there if valid[key] not in damaged}
+
+    todo = set(keys) - done(keys)
+    jobs = {key: _job(store, asked, settings, keys[key]) for key in keys if key in todo}
+    names = {scene.id: scene.name for scene in store.scenes.list()}
+    shared = SharedJobs(store, "changes", "comparison", jobs, keys, done, progress, again=verify)
+    results = shared.results(lambda arguments: run_jobs(compare_scenes, arguments, settings.engine))
+    kept = note_interruption(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are compared and kept")
+    with kept, closing(results):
+        for key, (report, counted) in results:
+            older, newer = (asked.visits[scene] for scene in keys[key])
+            found = store.changes.save(
+                report,
+                _key(settings, asked, older.scene, newer.scene),
+                older=older.scene,
+                newer=newer.scene,
+                S_newer_older=newer.S_map_scene.inverse() @ older.S_map_scene,
+                S_frame_newer=newer.S_map_scene,
+                num_at_comparison=counted,
+            )
+            shared.saved(key, f"{names[older.scene]}-{names[newer.scene]}: {len(found.changes)} changes")
+    return len(jobs)
+
+
+def _stands(one: Comparison, visits: Mapping[str, Visit]) -> bool:
+    """Return whether a comparison has its arrays, and was made at the present poses."""
+    return one.whole and not has_moved(visits[one.older], visits[one.newer], one.S_newer_older)
+
+
+def _valid(current: Iterable[Comparison], asked: ComparisonPlan, settings: Settings) -> list[Comparison]:
+    """Return the comparisons that are up to date."""
+    pairs = set(asked.pairs)
+    return [
+        one
+        for one in current
+        if (one.older, one.newer) in pairs
+        and _stands(one, asked.visits)
+        and one.key == _key(settings, asked, one.older, one.newer).digest
+    ]
+
+
+def _key(settings: Settings, asked: ComparisonPlan, older: str, newer: str) -> RecipeKey:
+    """Return the key of a pair's comparison, which depends on the metric scale."""
+    metres = asked.visits[newer].metres_per_unit
+    return recipe_key(settings.change).of(older, newer, *([] if metres == 1.0 else [f"metres_per_unit {metres!r}"]))
+
+
+def _job(store: Store, asked: ComparisonPlan, settings: Settings, pair: tuple[str, str]) -> tuple[object, ...]:
+    """Return the arguments of `compare_scenes`."""
+    sides = [(visit.scene, visit.S_map_scene, visit.when.isoformat()) for visit in (asked.visits[s] for s in pair)]
+    return (store.location, *sides, settings.change)
+
+
+def _names(names: Sequence[str]) -> str:
+    """Return names with the matching form of ``have``."""
+    shown = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+    return f"{shown} {'has' if len(names) == 1 else 'have'}"

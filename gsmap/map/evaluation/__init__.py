@@ -1,0 +1,1 @@
+"""Evaluate a map against ground truth."""

@@ -1,0 +1,1 @@
+"""Search for objects and places."""

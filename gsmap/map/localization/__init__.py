@@ -1,0 +1,1 @@
+"""Localize photos and scans, and store localized photos."""

@@ -1,0 +1,1 @@
+"""Associate segments over captures as objects, and report them."""

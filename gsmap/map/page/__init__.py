@@ -1,0 +1,1 @@
+"""Serve and write the page of a map."""

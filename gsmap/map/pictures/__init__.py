@@ -1,0 +1,1 @@
+"""Draw pairs, changes, objects and floor plans."""

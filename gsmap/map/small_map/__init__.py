@@ -1,0 +1,1 @@
+"""Export a small map for localization, and localize photos in it."""

@@ -1,0 +1,1 @@
+"""Store superseded captures in compact form."""

@@ -1,0 +1,1 @@
+"""Georeference a map, measure in it, and export it for surveyors."""
