@@ -30,3 +30,8 @@ def point_jacobian(point: np.ndarray) -> np.ndarray:
     (`gsmap.types.ScenePose`), so the point moves by ``[-skew(m) | I | m] xi``.
     """
     return np.concatenate([-skew(point), np.eye(3), point[:, None]], axis=1)
+
+
+def largest_sigma(covariance: np.ndarray) -> float:
+    """Return the standard deviation in the least certain direction of a covariance (N, N)."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1].clip(0)))

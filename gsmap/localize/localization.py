@@ -10,6 +10,7 @@ from PIL import Image
 
 from gsmap.geometry.filters import blur
 from gsmap.geometry.projection import in_image, project
+from gsmap.geometry.uncertainty import largest_sigma
 from gsmap.localize import covariance, evidence, feature_frames, matching, mismatch, probability, resection, verdict
 from gsmap.localize.candidate_renders import GREY, sample_mask
 from gsmap.localize.candidates import PoseCandidate, is_duplicate, match_views, propose_poses
@@ -279,10 +280,7 @@ def max_sigmas(covariance: np.ndarray | None) -> tuple[float, float]:
     """Return the largest standard deviations of rotation (rad) and of translation; inf if the covariance is None."""
     if covariance is None:
         return np.inf, np.inf
-    turn, shift = (
-        float(np.sqrt(np.linalg.eigvalsh(covariance[part, part])[-1].clip(0))) for part in (slice(3), slice(3, 6))
-    )
-    return turn, shift
+    return largest_sigma(covariance[:3, :3]), largest_sigma(covariance[3:6, 3:6])
 
 
 def rival_probability(poses: Sequence[EvaluatedPose]) -> float:

@@ -4,17 +4,7 @@
 browser load nothing. `gsmap.map.report.builder` collects the content.
 """
 
-from gsmap.report.content import (
-    Additions,
-    ChangePicture,
-    EdgeEntry,
-    Island,
-    PairPicture,
-    PoseDifferences,
-    Report,
-    SceneEntry,
-    StorageEntry,
-)
+from gsmap.report.content import EdgeEntry, Island, PoseDifferences, Report, SceneEntry
 from gsmap.report.page import SECTIONS, owner_of, page
 from gsmap.report.params import Params
 from gsmap.report.plan import Plan, PlanEdge, PlanScene, make_plan
@@ -22,19 +12,15 @@ from gsmap.report.top import density_picture, top_picture
 
 __all__ = [
     "SECTIONS",
-    "ChangePicture",
     "EdgeEntry",
     "Island",
     "PoseDifferences",
-    "Additions",
-    "PairPicture",
     "Params",
     "Plan",
     "PlanEdge",
     "Report",
     "SceneEntry",
     "PlanScene",
-    "StorageEntry",
     "density_picture",
     "make_plan",
     "owner_of",

@@ -31,24 +31,15 @@ class SceneEntry:
     Args:
         row: Row of the scene as in `gsmap list`.
         num_bytes: Size of the stored arrays.
-        middle: (3,) reference point of the uncertainty in the component frame: centre of the cameras, or of the
-            Gaussians if there are no cameras; None if the scene has no pose.
-        covariance_m2: (3, 3) covariance of the reference point in the component frame; None if unknown.
+        position_sigma_m: Standard deviation of the centre of its cameras, or of its Gaussians if it has no cameras, in
+            the least certain direction, metres; None if unknown.
         rotation_sigma_deg: Largest standard deviation of the rotation; None if unknown.
     """
 
     row: SceneRow
     num_bytes: int = 0
-    middle: np.ndarray | None = None
-    covariance_m2: np.ndarray | None = None
+    position_sigma_m: float | None = None
     rotation_sigma_deg: float | None = None
-
-    @property
-    def position_sigma_m(self) -> float | None:
-        """Standard deviation of the reference point in its least certain direction, metres; None if unknown."""
-        if self.covariance_m2 is None:
-            return None
-        return float(np.sqrt(max(0.0, np.linalg.eigvalsh(self.covariance_m2)[-1])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,14 +64,9 @@ class EdgeEntry:
 
     @property
     def use(self) -> str:
-        """``undecided``, ``tentative``, ``used``, ``unused`` (accepted, not in the solution), or the edge's status."""
-        if self.row.undecided:
-            return "undecided"
-        if self.row.used == "tentative":
-            return "tentative"
-        if self.row.used:
-            return "used"
-        return "unused" if self.row.status == "accepted" else self.row.status
+        """The use of the row, with ``tentative`` for ``one pair``, or the status of an edge that is not accepted."""
+        use = self.row.use or self.row.status
+        return "tentative" if use == "one pair" else use
 
     @property
     def kind(self) -> str:
@@ -118,56 +104,12 @@ class Island:
 
 
 @dataclass(frozen=True, eq=False)
-class PairPicture:
-    """A picture (H, W, 3) uint8 of both captures of a pair from the same cameras, as from ``gsmap show A:B
-    --picture``.
-    """
-
-    row: EdgeRow
-    picture: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class ChangePicture:
-    """A picture (H, W, 3) uint8 of a place before and after a change, with the change's id (``c12``)."""
-
-    change: str
-    picture: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class PoseDifferences:
     """Differences of the scene poses between a revision and an earlier revision."""
 
     before: int
     after: int
     rows: tuple[PoseChangeRow, ...]
-
-
-@dataclass(frozen=True)
-class Additions:
-    """Additions to the map since a date.
-
-    Args:
-        since: The date, ISO 8601.
-        scenes: Names of the scenes ingested since then.
-        num_tried: Number of pairs registered since then.
-        num_accepted: Number of these pairs that were accepted.
-    """
-
-    since: str
-    scenes: tuple[str, ...] = ()
-    num_tried: int = 0
-    num_accepted: int = 0
-
-
-@dataclass(frozen=True)
-class StorageEntry:
-    """Number and bytes of one kind of stored data."""
-
-    kind: str
-    count: int
-    num_bytes: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,14 +128,17 @@ class Report:
         revisions: The newest revisions, oldest first.
         num_revisions: Number of all revisions.
         moved: Pose differences between each revision and the previous one, newest first.
-        moved_since: Pose differences between the newest revision and the last one before the date of ``news``; None
-            without such a revision or date.
+        since: Date from which additions are reported, ISO 8601; None for no such date.
+        moved_since: Pose differences between the newest revision and the last one before ``since``; None without such
+            a revision or date.
+        new_scenes: Names of the scenes ingested after ``since``.
+        new_edges: Edges of the pairs registered after ``since``.
         changes: Changes between scenes; None if there are no poses.
         objects: Stored objects and rooms; None if there are none.
-        pair_pictures, change_pictures: Pictures of doubtful edges and of changes.
-        storage: Stored data by kind, largest first.
+        pair_pictures: Pictures (H, W, 3) uint8 of both captures of doubtful edges, by the ids of their scenes.
+        change_pictures: Pictures (H, W, 3) uint8 before and after changes, by id.
+        storage: Number and bytes of stored data by kind, largest first.
         seconds: Wall-clock seconds of registration by step.
-        news: Additions since a date; None if no date was given.
         notes: Notes on the report itself.
         params: Settings that bound the size of the report.
     """
@@ -209,14 +154,16 @@ class Report:
     revisions: tuple[RevisionRow, ...] = ()
     num_revisions: int = 0
     moved: tuple[PoseDifferences, ...] = ()
+    since: str | None = None
     moved_since: PoseDifferences | None = None
+    new_scenes: tuple[str, ...] = ()
+    new_edges: tuple[EdgeRow, ...] = ()
     changes: ChangesReport | None = None
     objects: ObjectsReport | None = None
-    pair_pictures: tuple[PairPicture, ...] = ()
-    change_pictures: tuple[ChangePicture, ...] = ()
-    storage: tuple[StorageEntry, ...] = ()
+    pair_pictures: Mapping[tuple[str, str], np.ndarray] = field(default_factory=dict)
+    change_pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
+    storage: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
-    news: Additions | None = None
     notes: tuple[str, ...] = ()
     params: Params = field(default_factory=Params)
 

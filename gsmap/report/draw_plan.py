@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsmap.geometry.uncertainty import largest_sigma
 from gsmap.report import svg
 from gsmap.report.markup import Markup, joined, tag
 from gsmap.report.plan import Plan
+from gsmap.report.top import data_address
 from gsmap.report.words import cut, length
 
 _WIDTH = 900.0
@@ -40,9 +41,8 @@ def draw_plan(plan: Plan, title: str) -> tuple[Markup, int]:
     magnified = _magnification(plan)
     parts: list[Markup] = []
     if plan.picture:
-        data = base64.b64encode(plan.picture).decode()
         parts.append(
-            tag("image", href=f"data:image/webp;base64,{data}", x="0", y="0", width=svg.f(size[0]),
+            tag("image", href=data_address(plan.picture), x="0", y="0", width=svg.f(size[0]),
                 height=svg.f(size[1]), preserveAspectRatio="none", class_=f"under {plan.picture_kind}")
         )  # fmt: skip
     order, crowded = list(range(len(plan.names))), len(plan.names) > _MANY
@@ -98,7 +98,7 @@ def ellipse(covariance: np.ndarray) -> np.ndarray:
 
 def _magnification(plan: Plan) -> int:
     """Choose a round factor at which most ellipses are visible, at least 1; 0 without ellipses."""
-    largest = [np.sqrt(max(float(np.linalg.eigvalsh(c)[-1]), 0.0)) for c in plan.covariances if c is not None]
+    largest = [largest_sigma(covariance) for covariance in plan.covariances if covariance is not None]
     known = [2.4477 * value for value in largest if value > 0]
     if not known:
         return 0

@@ -15,7 +15,7 @@ from gsmap.report import plots
 from gsmap.report.content import EdgeEntry, Island, PoseDifferences, Report
 from gsmap.report.draw_plan import draw_plan
 from gsmap.report.markup import Markup, Part, joined, tag
-from gsmap.report.top import picture_webp
+from gsmap.report.top import data_address, picture_webp
 from gsmap.report.words import (
     angle,
     chi_square,
@@ -44,6 +44,7 @@ _STANDING = {
     "act": "Needs computation",
     "empty": "Empty",
 }
+_KINDS = {"scenes": "captures", "graphs": "scene graphs", "indexes": "retrieval index", "models": "networks"}
 _ORDER = ("undecided", "tentative", "unused", "used", "rejected", "no_match", "never registered")
 
 
@@ -108,7 +109,7 @@ def _head(report: Report) -> Markup:
         ("Scenes", f"{len(rows):,}", _statuses(report)),
         ("Components", f"{len(report.islands):,}", count(alone, "single scene") if alone else ""),
         ("Gaussians", _short(sum(row.num_gaussians for row in rows)), ""),
-        ("On disk", size(sum(one.num_bytes for one in report.storage)), ""),
+        ("On disk", size(sum(num_bytes for _, num_bytes in report.storage.values())), ""),
         ("Captured", day(dates[0]) if dates else "–", ", ".join(dated)),
         ("Revision", str(report.revision.number) if report.revision else "none",
          moment(report.revision.created_at) if report.revision else "never solved"),
@@ -241,21 +242,19 @@ def _doubt(report: Report) -> Markup | None:
             tag("p", f"{count(len(strain), 'edge')} with a chi² above 99.9 % of correct edges: ",
                 ", ".join(f"{e.row.pair} (chi² {chi_square(e.chi2)})" for e in strain[:_FEW]), ".")
         )  # fmt: skip
-    entries = {edge.row.pair: edge for edge in doubtful}
-    for one in report.pair_pictures:
-        edge = entries.get(one.row.pair)
-        reason = one.row.reason or (edge.use if edge else "")
-        height, width = one.picture.shape[:2]
+    entries = {(edge.row.target, edge.row.source): edge for edge in doubtful}
+    for pair, picture in report.pair_pictures.items():
+        edge, row = entries[pair], entries[pair].row
+        likely = "" if edge.probability is None else f", correct with probability {probability(edge.probability)}"
         parts.append(
             tag(
                 "figure",
-                tag("h3", one.row.target_name, tag("span", " : ", class_="quiet"), one.row.source_name),
-                tag("p", tag("span", one.row.target_name), tag("span", one.row.source_name),
+                tag("h3", row.target_name, tag("span", " : ", class_="quiet"), row.source_name),
+                tag("p", tag("span", row.target_name), tag("span", row.source_name),
                     tag("span", "differences in red"), class_="heads"),
-                tag("img", src=_data(one.picture), alt=f"{one.row.pair} from the same cameras", width=width,
-                    height=height, loading="lazy"),
-                tag("figcaption", f"{reason}. {count(one.row.num_inliers, 'inlier')}, overlap "
-                    f"{number(one.row.overlap, 2)}{_probably(edge)}."),
+                _picture(picture, f"{row.pair} from the same cameras"),
+                tag("figcaption", f"{row.reason or edge.use}. {count(row.num_inliers, 'inlier')}, overlap "
+                    f"{number(row.overlap, 2)}{likely}."),
                 class_="pair",
             )
         )  # fmt: skip
@@ -266,16 +265,9 @@ def _doubt(report: Report) -> Markup | None:
     return joined(parts)
 
 
-def _probably(edge: EdgeEntry | None) -> str:
-    return (
-        ""
-        if edge is None or edge.probability is None
-        else f", correct with probability {probability(edge.probability)}"
-    )
-
-
-def _data(picture: np.ndarray) -> str:
-    return "data:image/webp;base64," + base64.b64encode(picture_webp(picture)).decode()
+def _picture(picture: np.ndarray, alt: str) -> Markup:
+    height, width = picture.shape[:2]
+    return tag("img", src=data_address(picture_webp(picture)), alt=alt, width=width, height=height, loading="lazy")
 
 
 # --- edges -----------------------------------------------------------------------------------------------------------
@@ -481,18 +473,17 @@ def _scenes(report: Report) -> Markup | None:
 
 def _changes(report: Report) -> Markup | None:
     parts: list[Part] = []
-    if report.news is not None:
-        news, some_ = report.news, ""
-        if news.scenes:
-            some_ = f" ({', '.join(cut(name) for name in news.scenes[:_FEW])}{', …' * (len(news.scenes) > _FEW)})"
+    if report.since is not None:
+        names, num_accepted = report.new_scenes, sum(edge.status == "accepted" for edge in report.new_edges)
+        some_ = f" ({', '.join(cut(name) for name in names[:_FEW])}{', …' * (len(names) > _FEW)})" if names else ""
         parts.append(
-            tag("p", f"Since {moment(news.since)}: {count(len(news.scenes), 'new scene')}{some_}, "
-                f"{count(news.num_tried, 'pair')} registered, {news.num_accepted:,} of them accepted.")
+            tag("p", f"Since {moment(report.since)}: {count(len(names), 'new scene')}{some_}, "
+                f"{count(len(report.new_edges), 'pair')} registered, {num_accepted:,} of them accepted.")
         )  # fmt: skip
     found = report.changes
     if found is not None:
-        pictures = {one.change: one.picture for one in report.change_pictures}
-        since = "" if report.news is None else " since then"
+        pictures = report.change_pictures
+        since = "" if report.since is None else " since then"
         if not found.pairs:
             parts.append(tag("p", f"No captures were compared with earlier ones{since}.", class_="quiet"))
         else:
@@ -503,8 +494,7 @@ def _changes(report: Report) -> Markup | None:
         cards = [
             tag(
                 "figure",
-                tag("img", src=_data(pictures[row.id]), alt=f"{row.kind}, before and after", loading="lazy",
-                    width=pictures[row.id].shape[1], height=pictures[row.id].shape[0]),
+                _picture(pictures[row.id], f"{row.kind}, before and after"),
                 tag("figcaption", tag("b", f"{row.id}: {row.kind}"), f", {row.older_name} to {row.newer_name}, "
                     f"confidence {number(row.confidence, 2)}"),
             )
@@ -630,16 +620,17 @@ def _moved_table(moved: PoseDifferences) -> Markup:
 def _cost(report: Report) -> Markup | None:
     if not report.storage:
         return None
-    total = sum(one.num_bytes for one in report.storage)
-    kept = [(one.kind, float(one.num_bytes), f"{one.kind}: {size(one.num_bytes)}") for one in report.storage]
+    stored = [(_KINDS.get(kind, kind), *figures) for kind, figures in report.storage.items()]
+    total = sum(num_bytes for *_, num_bytes in stored)
+    kept = [(kind, float(num_bytes), f"{kind}: {size(num_bytes)}") for kind, _, num_bytes in stored]
     rows: list[tuple[Part, ...]] = [
         (
-            joined(tag("i", class_=f"swatch s{i % 8}"), one.kind),
-            f"{one.count:,}",
-            size(one.num_bytes),
-            f"{100 * one.num_bytes / max(total, 1):.1f} %",
+            joined(tag("i", class_=f"swatch s{i % 8}"), kind),
+            f"{num:,}",
+            size(num_bytes),
+            f"{100 * num_bytes / max(total, 1):.1f} %",
         )
-        for i, one in enumerate(report.storage)
+        for i, (kind, num, num_bytes) in enumerate(stored)
     ]
     parts: list[Part] = [
         plots.stacked(kept, "Bytes by kind"),

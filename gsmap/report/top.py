@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 from collections.abc import Sequence
 
@@ -73,6 +74,11 @@ def picture_webp(picture: np.ndarray) -> bytes:
     from PIL import Image
 
     return _webp(Image.fromarray(picture))
+
+
+def data_address(webp: bytes) -> str:
+    """Return the address that embeds a WebP in a page."""
+    return f"data:image/webp;base64,{base64.b64encode(webp).decode()}"
 
 
 def _camera(plan: Plan, heights: np.ndarray, longest_px: int) -> Cameras:

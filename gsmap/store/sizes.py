@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from sqlalchemy import func, select
@@ -16,36 +15,23 @@ if TYPE_CHECKING:
 CATALOG, MODELS = "catalog", "models"
 
 
-@dataclass(frozen=True)
-class Size:
-    """The disk use of one kind of data.
-
-    Args:
-        kind: of array groups (``scenes``, ``graphs``, ``changes``, ``indexes``), ``models`` or ``catalog``.
-        count: number of groups or files.
-        num_bytes: size of their files, as written.
+def sizes(store: Store) -> dict[str, tuple[int, int]]:
+    """Return the number and the bytes of stored array groups by kind, of ``models`` and of the ``catalog``, largest
+    first; includes removed data until a prune, but no catalog on a server.
     """
-
-    kind: str
-    count: int
-    num_bytes: int
-
-
-def sizes(store: Store) -> list[Size]:
-    """Return the disk use by kind, largest first; includes removed data until a prune, but no catalog on a server."""
     bytes_of = func.coalesce(func.sum(files.c.size_bytes), 0)
     query = select(groups.c.kind, func.count(groups.c.id.distinct()), bytes_of)
     query = query.outerjoin(files, files.c.group_id == groups.c.id).group_by(groups.c.kind)
     copied = models.c.removed_at.is_(None) & (models.c.copied == 1)
     with store.catalog.read() as connection:
-        found = [Size(kind, count, int(num_bytes)) for kind, count, num_bytes in connection.execute(query)]
+        found = {kind: (count, int(num_bytes)) for kind, count, num_bytes in connection.execute(query)}
         kept = connection.execute(select(models.c.sha256, models.c.size_bytes).where(copied).distinct()).all()
     if kept:
-        found.append(Size(MODELS, len(kept), sum(row.size_bytes for row in kept)))
+        found[MODELS] = len(kept), sum(row.size_bytes for row in kept)
     catalog = store.folder / "map.sqlite"
     if store.catalog.is_sqlite and catalog.is_file():
-        found.append(Size(CATALOG, 1, catalog.stat().st_size))
-    return sorted(found, key=lambda one: (-one.num_bytes, one.kind))
+        found[CATALOG] = 1, catalog.stat().st_size
+    return dict(sorted(found.items(), key=lambda one: (-one[1][1], one[0])))
 
 
 def graph_sizes(store: Store) -> dict[str, int]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsmap.geometry.boxes import box_around, box_corners
 from gsmap.geometry.directions import median_direction
-from gsmap.geometry.uncertainty import middle_covariance_m2
+from gsmap.geometry.uncertainty import largest_sigma, middle_covariance_m2
 from gsmap.types import Scene, ScenePose, Sim3
 from gsmap.types.plain import fields_of, plain
 from gsmap.types.scene import SceneFacts
@@ -227,7 +227,7 @@ def _scene(
     covariance_m2 = None if pose is None else middle_covariance_m2(pose, middle, metres_per_unit)
     sigma_m = ellipsoid = None
     if covariance_m2 is not None:
-        sigma_m = float(np.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance_m2)[-1]))))
+        sigma_m = largest_sigma(covariance_m2)
         ellipsoid = (covariance_m2 / metres_per_unit**2).tolist()
     placed: SceneEntry = {
         "component": component,

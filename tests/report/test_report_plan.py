@@ -6,7 +6,7 @@ from PIL import Image
 
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import exp
-from gsmap.geometry.uncertainty import middle_covariance_m2
+from gsmap.geometry.uncertainty import largest_sigma, middle_covariance_m2
 from gsmap.report import PlanEdge, PlanScene, density_picture, make_plan, top_picture
 from gsmap.report.draw_plan import draw_plan, ellipse
 from gsmap.report.plan import rings
@@ -40,6 +40,8 @@ def test_the_middle_is_as_uncertain_as_drawn_poses_say():
     told = middle_covariance_m2(pose, middle, metres_per_unit=0.5)
     np.testing.assert_allclose(told, np.cov((0.5 * points).T), atol=0.06 * np.trace(told))
     assert middle_covariance_m2(ScenePose("a", pose.S_map_scene, 0, "placed"), middle, 1.0) is None
+    turn = exp_so3(np.array([0.4, -0.2, 1.0]))
+    assert largest_sigma(turn @ np.diag([1e-4, 9e-4, 4e-4]) @ turn.T) == pytest.approx(0.03)
 
 
 def test_a_plan_is_seen_from_above_with_its_walls_along_the_page():

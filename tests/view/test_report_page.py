@@ -11,12 +11,10 @@ from headless import Page
 from gsmap.report import (
     EdgeEntry,
     Island,
-    PairPicture,
     PlanEdge,
     PlanScene,
     Report,
     SceneEntry,
-    StorageEntry,
     make_plan,
     page,
 )
@@ -39,7 +37,7 @@ def made() -> Report:
                 f"{i:032x}", name, 1000, 0, 0, np.zeros((2, 3)), captured_at="2026-05-04", num_nodes=5, component=0,
                 S_map_scene=None, status=status, note=HOSTILE,
             ),
-            covariance_m2=np.eye(3) * 1e-4 * (i + 1),
+            position_sigma_m=0.01 * (i + 1) ** 0.5,
         )
         for i, (name, status) in enumerate(zip(names, statuses, strict=True))
     )  # fmt: skip
@@ -66,13 +64,13 @@ def made() -> Report:
         for k in (1, 2, 3)
     )  # fmt: skip
     todo = TodoRow(what="tentative", count=1, verb=f"gsmap list {HOSTILE}", meaning=HOSTILE)
-    picture = PairPicture(edges[1].row, rng.integers(0, 255, (90, 300, 3)).astype(np.uint8))
+    pictures = {(edges[1].row.target, edges[1].row.source): rng.integers(0, 255, (90, 300, 3)).astype(np.uint8)}
     return Report(
         title=HOSTILE, map_id="0" * 32, made_at="2026-05-04T10:00:00+00:00", version="0", scenes=scenes,
         status=MapStatus(todo=(todo,), scenes=3, components=1, islands=1, tentative=1, revision=3, metres_per_unit=1.0),
         edges=tuple(edges), islands=(Island(0, tuple(names), MetricScale(1.0, 0.01, "told"), plan),),
         revisions=revisions,
-        num_revisions=3, pair_pictures=(picture,), storage=(StorageEntry("captures", 3, 12345),), notes=(HOSTILE,),
+        num_revisions=3, pair_pictures=pictures, storage={"scenes": (3, 12345)}, notes=(HOSTILE,),
     )  # fmt: skip
 
 

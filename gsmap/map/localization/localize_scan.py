@@ -15,6 +15,7 @@ from gsmap.describe.unit import estimate_unit_m
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.formats import scans
 from gsmap.geometry.camera_synthesis import synthesise_cameras
+from gsmap.geometry.uncertainty import largest_sigma, point_jacobian
 from gsmap.ingest import read_captures
 from gsmap.localize.scan import AGREE_SIGMAS, as_gaussians
 from gsmap.localize.scan_consensus import ConsensusPose, PoseTolerance, ScanPose, combine_poses
@@ -303,12 +304,5 @@ def _sigmas(covariance: np.ndarray | None, middle: np.ndarray) -> tuple[float | 
     """Return the largest rotation sigma in degrees, and the largest position sigma at the scan's centre."""
     if covariance is None:
         return None, None
-    x, y, z = middle
-    moved = np.zeros((3, 7))
-    moved[:, :3] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    moved[:, 3:6], moved[:, 6] = np.eye(3), middle
-    at = moved @ covariance @ moved.T
-    return (
-        float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))),
-        float(np.sqrt(np.linalg.eigvalsh(at)[-1])),
-    )
+    moved = point_jacobian(middle)
+    return float(np.degrees(largest_sigma(covariance[:3, :3]))), largest_sigma(moved @ covariance @ moved.T)

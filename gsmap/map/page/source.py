@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import threading
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
@@ -29,6 +28,7 @@ from gsmap.map.reports.one_pair import is_one_pair, scenes_by_one_pair
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.map.stages.optimize import pose_basis
 from gsmap.methods import text_digest
+from gsmap.report.top import data_address
 from gsmap.store import Store, cache
 from gsmap.types import GaussianSource, PoseGraph, Prior, Scene
 from gsmap.types.plain import canonical
@@ -170,12 +170,11 @@ class MapPageSource:
             found: list[list[float]] = np.column_stack([share[:, 0], 1 - share[:, 1]]).round(4).tolist()
             return found
 
-        picture = None if plan.picture is None else base64.b64encode(plan.picture).decode()
         # Rows of a projection: share of the width, and of the height from the top, of a point (x, y, z, 1) of the map.
         along = plan.R_plan_map[:2] * plan.metres_per_unit / span[:, None]
         rows = np.column_stack([along * [[1], [-1]], [-low[0] / span[0], 1 + low[1] / span[1]]])
         return {
-            "picture": picture and f"data:image/webp;base64,{picture}",
+            "picture": data_address(plan.picture) if plan.picture else None,
             "size_m": span.tolist(),
             "P_plan_map": rows.tolist(),
             "scenes": [

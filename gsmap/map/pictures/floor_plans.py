@@ -11,7 +11,8 @@ from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.uncertainty import middle_covariance_m2
 from gsmap.report import Plan, PlanEdge, PlanScene, density_picture, make_plan, top_picture
 from gsmap.store import Store
-from gsmap.types import Gaussians, Scene, ScenePose
+from gsmap.types import Gaussians, ScenePose
+from gsmap.types.scene import SceneFacts
 
 MAX_GAUSSIANS = 2_000_000  # read for the pictures under floor plans; larger components are drawn by landmarks
 MAX_SCENES = 400  # with arrays read for plans; boxes of the others are drawn
@@ -32,7 +33,7 @@ class SceneArrays:
     gaussians: Gaussians | None = None
 
 
-def read_scene(store: Store, scene: Scene, *, whole: bool) -> SceneArrays:
+def read_scene(store: Store, scene: SceneFacts, *, whole: bool) -> SceneArrays:
     """Read a scene: its Gaussians, or the landmarks of its graph.
 
     Raises:
@@ -56,7 +57,7 @@ def read_scene(store: Store, scene: Scene, *, whole: bool) -> SceneArrays:
     return SceneArrays(points, track, eyes, middle, kind, gaussians)
 
 
-def box_of(scene: Scene) -> SceneArrays:
+def box_of(scene: SceneFacts) -> SceneArrays:
     """Return the corners of a scene's bounding box, without reading arrays."""
     none = np.zeros((0, 3))
     return SceneArrays(box_corners(scene.bounds), none, none, scene.bounds.mean(0))

@@ -18,7 +18,7 @@ from gsmap.durable import is_stream, write_text_output
 from gsmap.errors import ConfigError, CorruptError, NotFoundError
 from gsmap.geometry.directions import median_direction
 from gsmap.geometry.rotations import angle_between
-from gsmap.geometry.uncertainty import middle_covariance_m2
+from gsmap.geometry.uncertainty import largest_sigma, middle_covariance_m2
 from gsmap.map import reports
 from gsmap.map.changes.compare import plan_comparisons
 from gsmap.map.changes.rows import changes_report, filter_by_date
@@ -34,17 +34,13 @@ from gsmap.map.snapshot_read import snapshot_read
 from gsmap.map.status import status
 from gsmap.report import (
     SECTIONS,
-    Additions,
-    ChangePicture,
     EdgeEntry,
     Island,
-    PairPicture,
     Params,
     PlanEdge,
     PoseDifferences,
     Report,
     SceneEntry,
-    StorageEntry,
     owner_of,
     page,
 )
@@ -53,13 +49,12 @@ from gsmap.store import Store
 from gsmap.store.quarantine import CAPTURE
 from gsmap.store.registrations import StoredRegistration
 from gsmap.store.sizes import scene_sizes, sizes
-from gsmap.types import PoseGraph, Scene, ScenePose
+from gsmap.types import PoseGraph, ScenePose
 from gsmap.types.metric_scale import MetricScale
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.changes import ChangesReport
 from gsmap.types.rows.maps import MapStatus
 from gsmap.types.rows.objects import ObjectsReport
-from gsmap.types.rows.pairs import EdgeRow
 from gsmap.types.rows.reports import WrittenReport
 from gsmap.types.rows.revisions import RevisionRow
 from gsmap.version import __version__
@@ -70,14 +65,6 @@ _PICTURE_GAUSSIANS = 3_000_000  # of a pair of scenes that is drawn
 _PICTURE_PX = 320  # longer side of one view in a picture of a pair or a change
 _REVISIONS = 30  # in the history, the newest
 _COMPARED_REVISIONS = 8  # of these, each compared with the one before it
-_KINDS = {
-    "scenes": "captures",
-    "graphs": "scene graphs",
-    "changes": "changes",
-    "indexes": "retrieval index",
-    "models": "networks",
-    "catalog": "catalog",
-}
 
 
 def write_report(
@@ -132,53 +119,42 @@ def check_target(path: Path) -> None:
         )
 
 
-def _load_objects(store: Store, settings: Settings) -> ObjectsReport | None:
-    """Return the stored objects; None if they are out of date."""
-    try:
-        return objects_report(load_objects(store, settings))
-    except NotFoundError:
-        return None
-
-
-@dataclass(frozen=True, eq=False)
-class _CatalogState:
-    """The catalog of a map as of one transaction."""
-
-    status: MapStatus
-    scenes: list[Scene]
-    graph: PoseGraph | None
-    metres: dict[int, MetricScale]
-    ups: dict[str, np.ndarray]
-    edges: list[EdgeEntry]
-    changes: ChangesReport | None
-    report: Report
-
-
 @dataclass
 class _ReportBuilder:
-    """Builds one report."""
+    """Builds one report.
+
+    Args:
+        graph: Newest poses; None before the first optimize.
+        metres: Metric scale of each component.
+        ups: Direction opposite to gravity in the frame of each scene.
+        places: Short names for local paths, which a shared page must not show.
+        notes: Notes on omitted content.
+    """
 
     store: Store
     settings: Settings
     since: str | None
     progress: StageProgress
+    graph: PoseGraph | None = None
+    metres: dict[int, MetricScale] = field(default_factory=dict)
+    ups: dict[str, np.ndarray] = field(default_factory=dict)
+    places: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def report(self, pictures: bool) -> Report:
         self.progress("report", 0.0, "reading the catalog")
-        state = _state(self.store, self.settings, self.since)
+        made = _read_catalog(self.store, self)
         with self.store.located():
-            reads = self._arrays(state)
-        edges = _edges(state, reads)
-        islands = self._islands(state, reads, edges)
+            reads = self._arrays(made)
         made = replace(
-            state.report,
-            scenes=tuple(self._scene_entries(state, reads)),
-            edges=tuple(edges),
-            islands=tuple(islands),
+            made,
+            scenes=tuple(self._with_sigmas(entry, reads.get(entry.row.id)) for entry in made.scenes),
+            edges=tuple(self._with_residual(edge, reads) for edge in made.edges),
         )
+        planned, rest = made.islands[: self.params.islands], made.islands[self.params.islands :]
+        made = replace(made, islands=(*(self._with_plan(made, island, reads) for island in planned), *rest))
         if pictures:
-            made = replace(made, pair_pictures=self._pairs(made), change_pictures=self._changes(state))
+            made = replace(made, pair_pictures=self._pairs(made), change_pictures=self._changes(made))
         self.progress("report", 1.0, "")
         return replace(made, notes=tuple(self.notes))
 
@@ -186,16 +162,20 @@ class _ReportBuilder:
     def params(self) -> Params:
         return self.settings.report
 
+    @property
+    def poses(self) -> Mapping[str, ScenePose]:
+        return self.graph.poses if self.graph else {}
+
     # --- arrays ------------------------------------------------------------------------------------------------------
 
-    def _arrays(self, state: _CatalogState) -> dict[str, SceneArrays]:
+    def _arrays(self, made: Report) -> dict[str, SceneArrays]:
         """Read the points and centre of every placed scene, within the limits of a report."""
-        poses = state.graph.poses if state.graph else {}
-        placed = [scene for scene in state.scenes if scene.id in poses]
+        poses = self.poses
+        placed = [entry.row for entry in made.scenes if entry.row.id in poses]
         placed.sort(key=lambda scene: poses[scene.id].component)
         budget = MAX_GAUSSIANS
         whole: set[int] = set()
-        drawn = sorted({poses[scene.id].component for scene in placed})[: self.params.islands]
+        drawn = [island.component for island in made.islands[: self.params.islands]]
         for component in drawn:
             need = sum(scene.num_gaussians for scene in placed if poses[scene.id].component == component)
             if need <= budget:
@@ -213,67 +193,60 @@ class _ReportBuilder:
                 found[scene.id] = box_of(scene)
         return found
 
-    def _scene_entries(self, state: _CatalogState, reads: Mapping[str, SceneArrays]) -> Iterable[SceneEntry]:
-        poses = state.graph.poses if state.graph else {}
-        for entry in state.report.scenes:
-            pose, read = poses.get(entry.row.id), reads.get(entry.row.id)
-            if pose is None or read is None:
-                yield entry
-                continue
-            metre = state.metres.get(pose.component, MetricScale()).metres_per_unit
-            yield replace(
-                entry,
-                middle=pose.S_map_scene.apply(read.middle[None])[0],
-                covariance_m2=middle_covariance_m2(pose, read.middle, metre),
-                rotation_sigma_deg=_rotation_sigma_deg(pose),
-            )
+    def _with_sigmas(self, entry: SceneEntry, read: SceneArrays | None) -> SceneEntry:
+        pose = self.poses.get(entry.row.id)
+        if pose is None or read is None or pose.covariance is None:
+            return entry
+        covariance_m2 = middle_covariance_m2(pose, read.middle, self.metres[pose.component].metres_per_unit)
+        return replace(
+            entry,
+            position_sigma_m=None if covariance_m2 is None else largest_sigma(covariance_m2),
+            rotation_sigma_deg=float(np.degrees(largest_sigma(pose.covariance[:3, :3]))),
+        )
+
+    def _with_residual(self, edge: EdgeEntry, reads: Mapping[str, SceneArrays]) -> EdgeEntry:
+        """Return an edge with its residual under the newest poses."""
+        row, a, b = edge.row, self.poses.get(edge.row.target), self.poses.get(edge.row.source)
+        if a is None or b is None or a.component != b.component:
+            return edge
+        edge = replace(edge, component=a.component)
+        if row.S_target_source is None or row.status != "accepted":
+            return edge
+        middle = reads[row.source].middle[None]
+        alone = a.S_map_scene @ row.S_target_source
+        gap = float(np.linalg.norm(alone.apply(middle) - b.S_map_scene.apply(middle)))
+        turn = angle_between(alone.rotation, b.S_map_scene.rotation)
+        return replace(
+            edge, translation_m=gap * self.metres[a.component].metres_per_unit, rotation_deg=float(np.degrees(turn))
+        )
 
     # --- plans -------------------------------------------------------------------------------------------------------
 
-    def _islands(
-        self, state: _CatalogState, reads: Mapping[str, SceneArrays], edges: Sequence[EdgeEntry]
-    ) -> list[Island]:
-        members: dict[int, list[Scene]] = {}
-        poses = state.graph.poses if state.graph else {}
-        for scene in state.scenes:
-            if scene.id in poses:
-                members.setdefault(poses[scene.id].component, []).append(scene)
-        islands = []
-        for place, component in enumerate(sorted(members)):
-            scenes, metre = members[component], state.metres.get(component, MetricScale())
-            island = Island(component, tuple(scene.name for scene in scenes), metre)
-            if place < self.params.islands:
-                self.progress("report", 0.6, f"plan of component {component}")
-                island = self._plan(state, island, scenes, reads, edges)
-            islands.append(island)
-        return islands
-
-    def _plan(
-        self, state: _CatalogState, island: Island, scenes: Sequence[Scene], reads: Mapping[str, SceneArrays],
-        edges: Sequence[EdgeEntry],
-    ) -> Island:  # fmt: skip
-        assert state.graph is not None
-        poses = [state.graph.poses[scene.id] for scene in scenes]
-        found = [reads[scene.id] for scene in scenes]
+    def _with_plan(self, made: Report, island: Island, reads: Mapping[str, SceneArrays]) -> Island:
+        """Return a component with its floor plan."""
+        self.progress("report", 0.6, f"plan of component {island.component}")
+        scenes = [entry.row for entry in made.scenes if entry.row.component == island.component]
+        poses = [self.poses[scene.id] for scene in scenes]
         place = {scene.id: i for i, scene in enumerate(scenes)}
         lines = [
             PlanEdge(place[edge.row.target], place[edge.row.source], edge.kind, _tip(edge))
-            for edge in edges
+            for edge in made.edges
             if edge.row.target in place and edge.row.source in place and edge.use not in ("rejected", "no_match")
         ]
-        ups = [pose.S_map_scene.rotation @ state.ups[pose.scene] for pose in poses if pose.scene in state.ups]
+        ups = [pose.S_map_scene.rotation @ self.ups[pose.scene] for pose in poses if pose.scene in self.ups]
         metre, up = island.metre.metres_per_unit, median_direction(np.array(ups))
+        found = [reads[scene.id] for scene in scenes]
         plan, note = plan_of_component(island.scenes, poses, found, lines, up, metre, _PLAN_PX)
         return replace(island, plan=plan, note=note)
 
     # --- pictures ----------------------------------------------------------------------------------------------------
 
-    def _pairs(self, made: Report) -> tuple[PairPicture, ...]:
+    def _pairs(self, made: Report) -> dict[tuple[str, str], np.ndarray]:
         """Draw pictures of the most doubtful pairs."""
         sizes_ = {entry.row.id: entry.row.num_gaussians for entry in made.scenes}
         doubtful = [edge for edge in made.edges if edge.use in ("undecided", "tentative")]
         doubtful.sort(key=lambda edge: (-edge.doubt, edge.row.pair))
-        out: list[PairPicture] = []
+        out = {}
         left = self.params.pair_pictures
         for edge in doubtful:
             if left == 0:
@@ -289,73 +262,75 @@ class _ReportBuilder:
                 self.notes.append(f"{edge.row.pair} is not drawn: {self._hidden(str(error))}")
                 continue
             if picture is not None:
-                out.append(PairPicture(edge.row, picture))
-        return tuple(out)
+                out[ends] = picture
+        return out
 
-    def _changes(self, state: _CatalogState) -> tuple[ChangePicture, ...]:
+    def _changes(self, made: Report) -> dict[str, np.ndarray]:
         """Draw pictures of the changes with the highest confidence."""
-        found = [] if state.changes is None else [row for row in state.changes.changes if row.box_m is not None]
-        sizes_ = {scene.id: scene.num_gaussians for scene in state.scenes}
+        sizes_ = {entry.row.id: entry.row.num_gaussians for entry in made.scenes}
         found = [
             row
-            for row in found
-            if row.status != "rejected" and {row.older, row.newer} <= set(sizes_)
+            for row in (made.changes.changes if made.changes else ())
+            if row.box_m is not None and row.status != "rejected" and {row.older, row.newer} <= set(sizes_)
             and sizes_[row.older] + sizes_[row.newer] <= _PICTURE_GAUSSIANS
         ]  # fmt: skip
         found.sort(key=lambda row: -row.confidence)
         found = found[: self.params.change_pictures]
-        out = []
+        out = {}
         for pair in dict.fromkeys((row.older, row.newer) for row in found):
             try:
                 drawer = PairRenderer(self.store, *pair)
                 for row in found:
                     if (row.older, row.newer) == pair:
                         self.progress("report", 0.9, row.id)
-                        picture = drawer.picture(row, side_px=_PICTURE_PX)
-                        out.append(ChangePicture(row.id, picture))
+                        out[row.id] = drawer.picture(row, side_px=_PICTURE_PX)
             except (CorruptError, NotFoundError) as error:
                 self.notes.append(f"changes of {pair[0][:12]} are not drawn: {self._hidden(str(error))}")
-        return tuple(out)
+        return out
 
     def _hidden(self, text: str) -> str:
-        return _without_places(text, _places(self.store))
+        return _without_places(text, self.places)
 
 
 # --- the catalog -----------------------------------------------------------------------------------------------------
 
 
 @snapshot_read
-def _state(store: Store, settings: Settings, since: str | None) -> _CatalogState:
-    """Read the catalog and the parts of the report that need no arrays."""
+def _read_catalog(store: Store, builder: _ReportBuilder) -> Report:
+    """Read the parts of the report that need no arrays, and what the builder needs of the catalog for the rest."""
+    since, settings = builder.since, builder.settings
     when = None if since is None else parse_moment(since)
-    scenes, graph = store.scenes.list(), store.revisions.get()
-    metres = map_metres(store, graph)
-    edges = edge_entries(store, graph)
-    revisions = reports.revision_rows(store)
-    num_bytes = scene_sizes(store)
-    found = status(store, settings)
-    places = _places(store)
-    changes = None if graph is None else _known_changes(store, settings, since)
-    shown = Report(
+    builder.graph = graph = store.revisions.get()
+    builder.ups = up_directions(store.graphs.list(), store.scenes.list())
+    builder.metres, builder.places = map_metres(store, graph), _places(store)
+    revisions, num_bytes = reports.revision_rows(store), scene_sizes(store)
+    rows, edges = reports.scene_rows(store, metres=builder.metres), edge_entries(store, graph)
+    names: dict[int, list[str]] = {}
+    for row in rows:
+        if row.component is not None:
+            names.setdefault(row.component, []).append(row.name)
+    return Report(
         title=Path(store.location).name,
         map_id=store.id,
         made_at=datetime.now(UTC).isoformat(timespec="seconds"),
         version=__version__,
-        status=_hide_places(found, places),
-        scenes=tuple(SceneEntry(row, num_bytes.get(row.id, 0)) for row in reports.scene_rows(store, metres=metres)),
+        status=_hide_places(status(store, settings), builder.places),
+        scenes=tuple(SceneEntry(row, num_bytes.get(row.id, 0)) for row in rows),
+        edges=tuple(entry for entry, _ in edges),
+        islands=tuple(Island(one, tuple(names[one]), builder.metres[one]) for one in sorted(names)),
         revisions=tuple(revisions[-_REVISIONS:]),
         num_revisions=len(revisions),
         moved=tuple(_moved(store, revisions)),
+        since=since,
         moved_since=None if when is None else _moved_since(store, revisions, when),
-        changes=changes,
+        new_scenes=() if when is None else tuple(row.name for row in rows if is_after(row.ingested_at, when)),
+        new_edges=() if when is None else tuple(e.row for e, _ in edges if is_after(e.row.registered_at, when)),
+        changes=None if graph is None else _known_changes(store, settings, since),
         objects=None if graph is None else _load_objects(store, settings),
-        storage=tuple(StorageEntry(_KINDS.get(one.kind, one.kind), one.count, one.num_bytes) for one in sizes(store)),
+        storage=sizes(store),
         seconds=_seconds(stored for _, stored in edges),
-        news=None if when is None or since is None else _news(since, when, scenes, [entry.row for entry, _ in edges]),
         params=settings.report,
     )
-    ups = up_directions(store.graphs.list(), scenes)
-    return _CatalogState(found, scenes, graph, metres, ups, [entry for entry, _ in edges], changes, shown)
 
 
 def _known_changes(store: Store, settings: Settings, since: str | None) -> ChangesReport:
@@ -364,14 +339,12 @@ def _known_changes(store: Store, settings: Settings, since: str | None) -> Chang
     return changes_report(store, settings, asked, min_confidence=settings.change.min_confidence)
 
 
-def _news(since: str, when: datetime, scenes: Sequence[Scene], edges: Sequence[EdgeRow]) -> Additions:
-    tried = [edge for edge in edges if is_after(edge.registered_at, when)]
-    return Additions(
-        since=since,
-        scenes=tuple(scene.name for scene in scenes if is_after(scene.ingested_at, when)),
-        num_tried=len(tried),
-        num_accepted=sum(edge.status == "accepted" for edge in tried),
-    )
+def _load_objects(store: Store, settings: Settings) -> ObjectsReport | None:
+    """Return the stored objects; None if they are out of date."""
+    try:
+        return objects_report(load_objects(store, settings))
+    except NotFoundError:
+        return None
 
 
 def _moved(store: Store, revisions: Sequence[RevisionRow]) -> Iterable[PoseDifferences]:
@@ -399,36 +372,10 @@ def _seconds(stored: Iterable[StoredRegistration]) -> dict[str, float]:
     return dict(sorted(total.items(), key=lambda item: -item[1]))
 
 
-def _edges(state: _CatalogState, reads: Mapping[str, SceneArrays]) -> list[EdgeEntry]:
-    """Return every edge with its residual under the newest poses."""
-    poses = state.graph.poses if state.graph else {}
-    out = []
-    for entry in state.edges:
-        row = entry.row
-        a, b = poses.get(row.target), poses.get(row.source)
-        if a is not None and b is not None and a.component == b.component:
-            entry = replace(entry, component=a.component)
-            if row.S_target_source is not None and row.status == "accepted":
-                middle = reads[row.source].middle[None]
-                alone = a.S_map_scene @ row.S_target_source
-                gap = float(np.linalg.norm(alone.apply(middle) - b.S_map_scene.apply(middle)))
-                turn = angle_between(alone.rotation, b.S_map_scene.rotation)
-                metre = state.metres.get(a.component, MetricScale()).metres_per_unit
-                entry = replace(entry, translation_m=gap * metre, rotation_deg=float(np.degrees(turn)))
-        out.append(entry)
-    return out
-
-
 def _tip(edge: EdgeEntry) -> str:
     chi2 = "" if edge.chi2 is None else f", chi2 {edge.chi2:.3g}"
     off = "" if edge.translation_m is None else f", off by {edge.translation_m:.3g} m"
     return f"{edge.row.pair}: {edge.kind}{chi2}{off}"
-
-
-def _rotation_sigma_deg(pose: ScenePose) -> float | None:
-    if pose.covariance is None:
-        return None
-    return float(np.degrees(np.sqrt(max(0.0, float(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])))))
 
 
 # --- places of files -------------------------------------------------------------------------------------------------
