@@ -8,9 +8,13 @@ things by content. Indices of scenes are into ``MapSummary.scenes`` of the same 
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, NamedTuple, TypedDict
+from typing import Annotated, Any, Literal, NamedTuple, TypedDict, TypeVar
 
+from gsmap.types.plain import plain
+from gsmap.types.rows.base import Row
 from gsmap.types.scene import SceneFacts
+
+_Entry = TypeVar("_Entry")
 
 
 class Ts(NamedTuple):
@@ -35,6 +39,12 @@ ALIASES = {
     "Box": "[Vector, Vector]",
 }
 """Names of types in TypeScript: a matrix is 4 x 4, [s R | t], or 3 x 3; a box its lowest and highest corner."""
+
+
+def entry_of(row: Row, entry: type[_Entry]) -> _Entry:
+    """Return the part of an entry of the page that is the same in a row of the verbs."""
+    found: Any = {name: plain(getattr(row, name)) for name in entry.__annotations__ if hasattr(row, name)}
+    return found
 
 
 class Overview(TypedDict):
@@ -166,10 +176,10 @@ class RevisionEntry(TypedDict):
         poses: GET: RevisionPoses; null if they were pruned.
     """
 
-    id: int
+    number: int
     created_at: str
-    num_scenes: int
-    num_edges_used: int
+    scenes: int
+    edges_used: int
     poses: str | None
 
 
@@ -179,9 +189,9 @@ class ChangeEntry(TypedDict):
     Args:
         id: such as "c12".
         box: bounding box; map frame.
-        before: index of the older scene.
-        after: index of the newer scene.
-        at: date of the newer scene.
+        older: index of the older scene.
+        newer: index of the newer scene.
+        newer_at: date of the newer scene.
         status: ``open``, ``confirmed`` or ``rejected``.
         note: note of its review.
         pictures: GET: pictures before and after, from the same camera.
@@ -191,9 +201,9 @@ class ChangeEntry(TypedDict):
     kind: Annotated[str, Literal["appeared", "disappeared", "moved", "recoloured", "replaced", "lighting"]]
     component: int
     box: Box
-    before: int
-    after: int
-    at: str | None
+    older: int
+    newer: int
+    newer_at: str | None
     confidence: float
     status: str
     note: str
@@ -205,16 +215,16 @@ class PhotoEntry(TypedDict):
 
     Args:
         T_map_camera: pose in the map frame.
-        intrinsics: fx, fy, cx, cy in pixels.
-        size: width and height in pixels.
+        intrinsics_px: fx, fy, cx, cy.
+        size_px: width and height.
         captured_at: date of the photo.
     """
 
     file: str
     component: int
     T_map_camera: Matrix
-    intrinsics: Vector4
-    size: Pair
+    intrinsics_px: Vector4
+    size_px: Pair
     captured_at: str | None
 
 
@@ -289,7 +299,7 @@ class RevisionScene(TypedDict):
 class RevisionPoses(TypedDict):
     """GET: the poses of a revision, without scenes that were removed since."""
 
-    id: int
+    number: int
     scenes: list[RevisionScene]
 
 
@@ -404,8 +414,8 @@ class ObjectEntry(TypedDict):
     box: Box
     first_seen: str | None
     last_seen: str | None
-    present: bool
-    num_sightings: int
+    there: bool
+    seen: int
     room: str | None
     picture: str | None
 
@@ -429,9 +439,9 @@ class RoomEntry(TypedDict):
 class RelationEntry(TypedDict):
     """A relation of two objects by id: ``on``, ``in`` or ``next to``."""
 
-    a: str
-    b: str
-    kind: str
+    subject: str
+    relation: str
+    other: str
 
 
 class GraphEntry(TypedDict):
@@ -448,11 +458,11 @@ class GraphEntry(TypedDict):
 
 
 class HistoryRow(TypedDict):
-    """An observation of a place; ``scene`` is an index, ``object`` an id."""
+    """An observation of an object; ``scene`` is an index, ``object`` an id."""
 
-    at: str | None
+    captured_at: str | None
     scene: int
-    what: str
+    state: str
     object: str | None
 
 

@@ -117,7 +117,7 @@ class _Maker:
             yield f"scenes/{entry.scene.id}/extras.json", _json(extras or {"layers": {}, "cameras": []})
         for revision in view.revisions:
             if revision["poses"] is not None:
-                yield revision["poses"], _json(self.page_source.revision(revision["id"]))
+                yield revision["poses"], _json(self.page_source.revision(revision["number"]))
         yield from self._edges(view, pictures)
         drawn = []
         surest = sorted(view.changes, key=lambda change: -change["confidence"])

@@ -133,7 +133,7 @@ def test_what_a_person_does_is_done_by_the_maps_own_doors(folder):
         assert m.show_pair("hall:yard").review == "confirm"
         after = page.told("actions/optimize", {})["map"]
         assert after["revision"] == 2
-        assert [one["id"] for one in after["revisions"]] == [1, 2]
+        assert [one["number"] for one in after["revisions"]] == [1, 2]
         assert not after["stale"]
         S = Sim3(np.eye(3), np.array([1.0, 2, 3]), 2.0)
         prior = {"scene": ids[1], "S_map_scene": S.matrix().tolist(), "sigma_m": 0.1, "sigma_deg": 2.0}

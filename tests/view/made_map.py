@@ -65,9 +65,9 @@ def made_map(scenes: int = 12, second_island: int = 2, hostile: bool = False) ->
             "kind": kind,
             "component": 0,
             "box": [[3.0 * i, 0, 0], [3.0 * i + 0.6, 0.5, 0.8]],
-            "before": i,
-            "after": i + 1,
-            "at": rows[i + 1]["captured_at"],
+            "older": i,
+            "newer": i + 1,
+            "newer_at": rows[i + 1]["captured_at"],
             "confidence": 0.95 - 0.07 * i,
             "status": "open",
             "pictures": [f"changes/c{i + 1}-before.jpg", f"changes/c{i + 1}-after.jpg"],
@@ -110,10 +110,10 @@ def made_map(scenes: int = 12, second_island: int = 2, hostile: bool = False) ->
         "edges": edges,
         "revisions": [
             {
-                "id": k,
+                "number": k,
                 "created_at": f"2025-0{k}-02T10:00:00+00:00",
-                "num_scenes": scenes - 3 + k,
-                "num_edges_used": 6 + k,
+                "scenes": scenes - 3 + k,
+                "edges_used": 6 + k,
                 "poses": f"revisions/{k}.json",
             }
             for k in (1, 2, 3)
@@ -126,8 +126,8 @@ def made_map(scenes: int = 12, second_island: int = 2, hostile: bool = False) ->
                 "file": f"IMG_{i:04d}.jpg",
                 "component": 0,
                 "T_map_camera": [[1, 0, 0, 2.0 * i], [0, 0, 1, -4], [0, -1, 0, 1.6], [0, 0, 0, 1]],
-                "intrinsics": [1000, 1000, 960, 540],
-                "size": [1920, 1080],
+                "intrinsics_px": [1000, 1000, 960, 540],
+                "size_px": [1920, 1080],
                 "captured_at": f"2025-03-0{i + 1}T12:00:00+00:00",
             }
             for i in range(3)
@@ -223,7 +223,7 @@ class MadeServer:
             self.map["revision"] += 1
             last = self.map["revisions"][-1]
             number = self.map["revision"]
-            self.map["revisions"].append({**last, "id": number, "poses": f"revisions/{number}.json"})
+            self.map["revisions"].append({**last, "number": number, "poses": f"revisions/{number}.json"})
         self.map["stale"] = name != "optimize"
 
     def _review(self, verdict: str, what: str, note: str) -> None:
@@ -253,8 +253,13 @@ class MadeServer:
             return _json(
                 {
                     "rows": [
-                        {"at": "2024-02-11", "scene": 1, "what": "a chair appeared", "object": "o1"},
-                        {"at": "2024-05-11", "scene": 4, "what": f"it was moved ({query[:2]})", "object": None},
+                        {"captured_at": "2024-02-11", "scene": 1, "state": "a chair appeared", "object": "o1"},
+                        {
+                            "captured_at": "2024-05-11",
+                            "scene": 4,
+                            "state": f"it was moved ({query[:2]})",
+                            "object": None,
+                        },
                     ]
                 }
             )
@@ -265,7 +270,7 @@ class MadeServer:
                 {k: s[k] for k in ("component", "status", "S_map_scene")} | {"scene": i}
                 for i, s in enumerate(self.map["scenes"][: 6 + 2 * number])
             ]
-            return _json({"id": number, "scenes": rows})
+            return _json({"number": number, "scenes": rows})
         if folder == "edges" and rest.endswith(".json"):
             return _json(self._detail(rest.removesuffix(".json")))
         if folder == "plans":
@@ -334,13 +339,13 @@ class MadeServer:
                 "box": [[2.0 * k - 0.3, -0.3, 0], [2.0 * k + 0.3, 0.3, 0.9]],
                 "first_seen": "2024-01-11",
                 "last_seen": f"2025-0{k + 1}-11",
-                "present": k != 2,
-                "num_sightings": 3 + k,
+                "there": k != 2,
+                "seen": 3 + k,
                 "room": f"r{1 + k // 2}",
             }
             for k, name in enumerate(names)
         ]
-        relations = [{"a": "o1", "b": "o2", "kind": "stands beside"}]
+        relations = [{"subject": "o1", "relation": "stands beside", "other": "o2"}]
         rooms = []
         for k, other in ((0, "r2"), (1, "r1")):
             corners = [[4.0 * k + x, y, 0] for x, y in ((-1, -1), (3, -1), (3, 2), (-1, 2))]

@@ -297,13 +297,13 @@ def test_changes_objects_photos_and_correspondences_are_drawn_and_picked(seen):
     camera = cameras(np.array([[0.0, -1.2, -0.9]]), np.array([[0, -1.2, 1]]))
     plain = seen.stand(camera)
     box = [[-0.3, -1.5, 0.5], [0.3, -0.9, 1.0]]
-    change = {"id": "c1", "kind": "moved", "component": 0, "box": box, "before": 0, "after": 1, "at": None,
+    change = {"id": "c1", "kind": "moved", "component": 0, "box": box, "older": 0, "newer": 1, "newer_at": None,
               "confidence": 1, "status": "open", "pictures": None}  # fmt: skip
     thing = {"id": "a", "name": "chair", "component": 0, "position": [0, -1.2, 0.7], "box": box, "first_seen": None,
-             "last_seen": None, "present": True, "num_sightings": 1, "room": "r1"}  # fmt: skip
+             "last_seen": None, "there": True, "seen": 1, "room": "r1"}  # fmt: skip
     room = {"id": "r1", "component": 0, "outline": [box], "area_m2": 1, "page_source": []}
-    photo = {"file": "p.jpg", "component": 0, "T_map_camera": pose(0.0).tolist(), "intrinsics": [1, 1, 0.5, 0.5],
-             "size": [1, 1], "captured_at": None}  # fmt: skip
+    photo = {"file": "p.jpg", "component": 0, "T_map_camera": pose(0.0).tolist(), "intrinsics_px": [1, 1, 0.5, 0.5],
+             "size_px": [1, 1], "captured_at": None}  # fmt: skip
     photo["T_map_camera"][1][3], photo["T_map_camera"][2][3] = -1.2, 0.4
     for call in (
         f"setChanges([{json.dumps(change)}])",

@@ -354,7 +354,7 @@ def test_a_scene_that_was_purged_while_its_tree_was_made_is_not_kept(server, pag
 
 def test_everything_else_is_told_by_its_address(server, page_source):
     assert told(server, f"/scenes/{A}/extras.json") == {"layers": {}, "cameras": []}
-    assert told(server, "/revisions/1.json")["id"] == 1
+    assert told(server, "/revisions/1.json")["number"] == 1
     assert told(server, "/graph.json") == {"objects": [], "relations": [], "rooms": []}
     assert told(server, "/history.json?at=0,1,2&component=0") == {"rows": []}
     names = ("revisions/2.json", "changes/c1-after.jpg", "merged/0/tileset.json")

@@ -99,7 +99,7 @@ class MadeDoors:
     def revision(self, number: int) -> dict[str, Any]:
         if number != 1:
             raise NotFoundError(f"no revision {number}")
-        return {"id": 1, "scenes": []}
+        return {"number": 1, "scenes": []}
 
     def edge(self, target: str, source: str) -> dict[str, Any]:
         return {"target": 0, "source": 1, "steps": []}

@@ -12,7 +12,7 @@ from gsmap.map.reports import pair_report
 from gsmap.store import Store
 from gsmap.types import NodeLayer, Scene, SceneGraph, Sim3
 from gsmap.types.rows.pairs import ExplanationStep
-from gsmap.view.contract import PairDetail
+from gsmap.view.contract import PairDetail, PairEvent, Step, entry_of
 
 if TYPE_CHECKING:
     from gsmap.map.settings import Settings
@@ -37,12 +37,10 @@ def pair_detail(
     shared = [] if S is None else correspondences(store, ends, S, S_map_target)
     return {
         "S_target_source": None if S is None else S.matrix().tolist(),
-        "steps": [
-            {"name": step.name, "value": _text(step), "bar": step.bar, "passed": step.passed} for step in said.steps
-        ],
+        "steps": [{**entry_of(step, Step), "value": _text(step)} for step in said.steps],
         "advice": [said.advice] if said.advice else [],
         "correspondences": shared,
-        "events": [{"at": one.at, "what": one.what, "reason": one.reason} for one in pair.history],
+        "events": [entry_of(one, PairEvent) for one in pair.history],
     }
 
 

@@ -35,7 +35,15 @@ from gsmap.types.plain import canonical
 from gsmap.types.world import ImagePoint
 from gsmap.view import ViewMap, ViewScene, contract
 from gsmap.view.content import up_of
-from gsmap.view.contract import FloorPlan, GraphEntry, PlacedPairDetail, PlaceHistory, RevisionPoses, SceneExtras
+from gsmap.view.contract import (
+    FloorPlan,
+    GraphEntry,
+    PlacedPairDetail,
+    PlaceHistory,
+    RevisionPoses,
+    SceneExtras,
+    entry_of,
+)
 from gsmap.view.page_source import Action, PairPictures
 from gsmap.view.pair_picture import looks_at
 from gsmap.view.trees import VERSION, TreeParams
@@ -123,7 +131,7 @@ class MapPageSource:
             raise NotFoundError(f"there is no revision {number}", code="revision_not_found")
         at = self._places()
         return {
-            "id": number,
+            "number": number,
             "scenes": [
                 {
                     "scene": at[pose.scene],
@@ -231,17 +239,10 @@ class MapPageSource:
         return {
             "objects": [
                 {
-                    "id": row.id,
+                    **entry_of(row, contract.ObjectEntry),
                     "name": row.name or "",
                     "label": row.label or "",
-                    "component": row.component,
-                    "position": row.position.tolist(),
                     "box": boxes[row.id].tolist(),
-                    "first_seen": row.first_seen,
-                    "last_seen": row.last_seen,
-                    "present": row.there,
-                    "num_sightings": row.seen,
-                    "room": row.room,
                     "picture": f"objects/{row.id}.jpg",
                 }
                 for row in report.objects
@@ -251,17 +252,8 @@ class MapPageSource:
                 for one in self.content().changes
                 if (room := known.room_of_box(one["component"], np.array(one["box"]))) is not None
             },
-            "relations": [{"a": one.subject, "b": one.other, "kind": one.relation} for one in report.relations],
-            "rooms": [
-                {
-                    "id": row.id,
-                    "component": row.component,
-                    "outline": row.outline.tolist(),
-                    "area_m2": row.area_m2,
-                    "doors": list(row.doors),
-                }
-                for row in report.rooms
-            ],
+            "relations": [entry_of(row, contract.RelationEntry) for row in report.relations],
+            "rooms": [entry_of(row, contract.RoomEntry) for row in report.rooms],
         }
 
     def object_picture(self, id: str) -> np.ndarray:
@@ -278,7 +270,7 @@ class MapPageSource:
         report = history_report(known, at, None)
         return {
             "rows": [
-                {"at": row.captured_at, "scene": places[row.scene], "what": row.state, "object": row.object}
+                {**entry_of(row, contract.HistoryRow), "scene": places[row.scene]}
                 for row in report.sightings
                 if row.object in inside and row.scene in places
             ]
@@ -345,10 +337,7 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
         _edges(store, placed, at),
         [
             {
-                "id": row.number,
-                "created_at": row.created_at,
-                "num_scenes": row.scenes,
-                "num_edges_used": row.edges_used,
+                **entry_of(row, contract.RevisionEntry),
                 "poses": f"revisions/{row.number}.json" if row.dropped_at is None else None,
             }
             for row in reports.revision_rows(store)
@@ -400,18 +389,14 @@ def _edges(store: Store, placed: PoseGraph | None, at: Mapping[str, int]) -> lis
         words = [] if row.review is None else store.registrations.reviews(row.target, row.source)
         out.append(
             {
+                **entry_of(row, contract.EdgeEntry),
                 "target": at[row.target],
                 "source": at[row.source],
-                "status": row.status,
                 "used": row.used if placed else None,
                 "one_pair": outcome is not None and is_one_pair(outcome),
-                "undecided": row.undecided,
-                "review": row.review,
                 "note": words[-1].note if words else "",
-                "reason": row.reason,
                 "probability": entry.probability,
                 "overlap": row.overlap if np.isfinite(row.overlap) else 0.0,
-                "num_inliers": row.num_inliers,
                 "doubt": entry.doubt,
                 "registration": stored.number,
                 "detail": f"edges/{row.target}-{row.source}.json",
@@ -429,15 +414,10 @@ def _changes(
     report = changes_report(store, settings, asked, min_confidence=settings.change.min_confidence)
     return [
         {
-            "id": row.id,
-            "kind": row.kind,
-            "component": row.component,
-            "box": row.box.tolist(),
-            "before": at[row.older],
-            "after": at[row.newer],
-            "at": row.newer_at,
+            **entry_of(row, contract.ChangeEntry),
+            "older": at[row.older],
+            "newer": at[row.newer],
             "confidence": row.confidence if np.isfinite(row.confidence) else 0.0,
-            "status": row.status,
             "note": _note_of(store, row.id),
             "pictures": [f"changes/{row.id}-{side}.jpg" for side in ("before", "after")],
         }
@@ -463,26 +443,17 @@ def _photos(store: Store, placed: PoseGraph | None, living: Collection[str]) -> 
         pose = placed.poses[one.scene]
         T = transform_poses(one.T_scene_camera, pose.S_map_scene)
         width, height = np.maximum(1, np.round(2 * one.intrinsics_px[2:])).astype(int).tolist()
-        out.append(_photo(one.image, pose.component, T, one.intrinsics_px, [width, height]))
-    for row in photo_rows(store):
-        if row.component is not None and row.T_map_camera is not None and row.scene in living:
-            out.append(
-                _photo(row.file, row.component, row.T_map_camera, row.intrinsics_px, [*row.size_px], row.captured_at)
-            )
-    return out
-
-
-def _photo(
-    file: str, component: int, T: np.ndarray, intrinsics_px: np.ndarray, size: list[int], at: str | None = None
-) -> contract.PhotoEntry:
-    return {
-        "file": file,
-        "component": component,
-        "T_map_camera": T.tolist(),
-        "intrinsics": intrinsics_px.tolist(),
-        "size": size,
-        "captured_at": at,
-    }
+        entry: contract.PhotoEntry = {
+            "file": one.image,
+            "component": pose.component,
+            "T_map_camera": T.tolist(),
+            "intrinsics_px": one.intrinsics_px.tolist(),
+            "size_px": [width, height],
+            "captured_at": None,
+        }
+        out.append(entry)
+    rows = (row for row in photo_rows(store) if row.component is not None and row.scene in living)
+    return out + [entry_of(row, contract.PhotoEntry) for row in rows]
 
 
 def cache_folder() -> Path:

@@ -71,7 +71,7 @@ export async function createStage(options: StageOptions): Promise<Stage> {
     setRuler: note("setRuler"),
     setChanges: (changes) => calls.push(["setChanges", changes.map((one) => one.id)]),
     setCorrespondences: (detail) => calls.push(["setCorrespondences", detail?.correspondences.length ?? null]),
-    setPoses: (revision) => calls.push(["setPoses", revision?.id ?? null]),
+    setPoses: (revision) => calls.push(["setPoses", revision?.number ?? null]),
     drag: (scene, how) => {
       onDrag = how;
       calls.push(["drag", scene]);

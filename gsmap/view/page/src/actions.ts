@@ -45,7 +45,7 @@ export function planOf(state: State): Resource<FloorPlan> | null {
 
 /** Where everything lay in the revision that is looked at; null for the newest, whose poses the map has. */
 export function posesOf(state: State): Resource<RevisionPoses> | null {
-  const uri = state.map?.revisions.find((row) => row.id === state.revision)?.poses;
+  const uri = state.map?.revisions.find((row) => row.number === state.revision)?.poses;
   return uri ? revisions.get(uri) : null;
 }
 
@@ -85,7 +85,7 @@ export function setMap(map: MapSummary): void {
     left: kept(state.left),
     split: state.split && { ...state.split, ...kept(state.split) },
     selection: selection && isThere(map, selection) ? selection : null,
-    revision: map.revisions.some((row) => row.id === state.revision) ? state.revision : null,
+    revision: map.revisions.some((row) => row.number === state.revision) ? state.revision : null,
   });
   histories.forget();
 }
@@ -391,7 +391,7 @@ function objectAt(point: Vector) {
   const holds = ([low, high]: Box) => point.every((v, i) => v >= (low[i] ?? v) && v <= (high[i] ?? v));
   const size = ([low, high]: Box) => low.reduce((sum, v, i) => sum * ((high[i] ?? v) - v), 1);
   return objectsOf(state)
-    .filter((one) => one.component === state.component && one.present && holds(one.box))
+    .filter((one) => one.component === state.component && one.there && holds(one.box))
     .sort((a, b) => size(a.box) - size(b.box))[0];
 }
 

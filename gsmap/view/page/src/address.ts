@@ -96,7 +96,7 @@ export function read(hash: string, map: MapSummary): Shared {
     edgeFilter: one("edges", EDGE_FILTERS, "doubtful"),
     until: until && DAY.test(until) ? until : null,
     revision:
-      map.revisions.some((row) => row.id === revision && row.poses !== null) && revision !== map.revision
+      map.revisions.some((row) => row.number === revision && row.poses !== null) && revision !== map.revision
         ? revision
         : null,
   };

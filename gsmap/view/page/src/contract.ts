@@ -76,10 +76,10 @@ export interface EdgeEntry {
 }
 
 export interface RevisionEntry {
-  id: number;
+  number: number;
   created_at: string;
-  num_scenes: number;
-  num_edges_used: number;
+  scenes: number;
+  edges_used: number;
   poses: string | null;
 }
 
@@ -88,9 +88,9 @@ export interface ChangeEntry {
   kind: "appeared" | "disappeared" | "moved" | "recoloured" | "replaced" | "lighting";
   component: number;
   box: Box;
-  before: number;
-  after: number;
-  at: string | null;
+  older: number;
+  newer: number;
+  newer_at: string | null;
   confidence: number;
   status: string;
   note: string;
@@ -101,8 +101,8 @@ export interface PhotoEntry {
   file: string;
   component: number;
   T_map_camera: Matrix;
-  intrinsics: Vector4;
-  size: [number, number];
+  intrinsics_px: Vector4;
+  size_px: [number, number];
   captured_at: string | null;
 }
 
@@ -148,7 +148,7 @@ export interface RevisionScene {
 }
 
 export interface RevisionPoses {
-  id: number;
+  number: number;
   scenes: RevisionScene[];
 }
 
@@ -228,8 +228,8 @@ export interface ObjectEntry {
   box: Box;
   first_seen: string | null;
   last_seen: string | null;
-  present: boolean;
-  num_sightings: number;
+  there: boolean;
+  seen: number;
   room: string | null;
   picture: string | null;
 }
@@ -243,9 +243,9 @@ export interface RoomEntry {
 }
 
 export interface RelationEntry {
-  a: string;
-  b: string;
-  kind: string;
+  subject: string;
+  relation: string;
+  other: string;
 }
 
 export interface GraphEntry {
@@ -256,9 +256,9 @@ export interface GraphEntry {
 }
 
 export interface HistoryRow {
-  at: string | null;
+  captured_at: string | null;
   scene: number;
-  what: string;
+  state: string;
   object: string | null;
 }
 

@@ -117,8 +117,8 @@ export function listedChanges(state: State): ChangeEntry[] {
   const shown = (one: ChangeEntry) =>
     changeFilter === "all" || one.status === changeFilter || isSelected(state, "change", one.id);
   return (map?.changes ?? [])
-    .filter((one) => one.component === component && isBy(one.at, until) && shown(one))
-    .sort((a, b) => (b.at ?? "").localeCompare(a.at ?? "") || b.confidence - a.confidence);
+    .filter((one) => one.component === component && isBy(one.newer_at, until) && shown(one))
+    .sort((a, b) => (b.newer_at ?? "").localeCompare(a.newer_at ?? "") || b.confidence - a.confidence);
 }
 
 const fits = (query: string, ...texts: (string | null)[]): boolean => {
@@ -160,7 +160,7 @@ export function pairFacts({ map, pair: [a, b] }: State): PairFacts | null {
     older,
     newer,
     edge: map.edges.find((edge) => isThis(edge.target, edge.source)),
-    changes: map.changes.filter((change) => isThis(change.before, change.after)),
+    changes: map.changes.filter((change) => isThis(change.older, change.newer)),
     isCompared: map.compared.some((pair) => isThis(...pair)),
     isUncompared: map.uncompared.some((pair) => isThis(...pair)),
   };

@@ -33,7 +33,7 @@ export class ChangeDetail extends Panel {
     const change = derive.selectedChange(now);
     const { map } = now;
     if (!map || !change) return nothing;
-    const [before, after] = [map.scenes[change.before], map.scenes[change.after]];
+    const [before, after] = [map.scenes[change.older], map.scenes[change.newer]];
     const unit = derive.componentOf(map, change.component)?.metres_per_unit ?? 1;
     const sides = change.box[1].map((v, i) => metres((v - (change.box[0][i] ?? v)) * unit));
     return html`
@@ -41,7 +41,7 @@ export class ChangeDetail extends Panel {
         html`<gs-kind .change=${change}></gs-kind> ${actions.titleOfChange(change)}`,
         html`<span class="mark ${STANDS[change.status] ?? ""}">${change.status}</span>
           <span>confidence ${percent(change.confidence)}</span>
-          <span class="anywhere">${pairText(map, change.before, change.after)}</span> <span>change ${change.id}</span>`,
+          <span class="anywhere">${pairText(map, change.older, change.newer)}</span> <span>change ${change.id}</span>`,
         true,
       )}
       <div class="body">

@@ -142,9 +142,9 @@ export class Place extends Panel {
       ${rows.map((row) => {
         const object = row.object;
         return html`<li>
-          <span class="muted figures">${day(row.at)}</span
+          <span class="muted figures">${day(row.captured_at)}</span
           ><span
-            >${row.what}
+            >${row.state}
             ${
               object
                 ? html`<button class="plain" @click=${() => actions.select({ kind: "object", key: object })}>

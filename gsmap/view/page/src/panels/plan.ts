@@ -194,7 +194,7 @@ export class Plan extends Panel {
     const isListed = !this.small && (state.tab === "things" || selection?.kind === "object");
     const objects = isListed
       ? this.objects(graph)
-          .filter((one) => one.present)
+          .filter((one) => one.there)
           .sort(bySize)
       : [];
     const boxes = [...changes, ...this.objects(graph)].filter(({ id }) => bold(id)).map(({ box }) => box);

@@ -70,10 +70,10 @@ export class Thing extends Panel {
     };
     const picture = relative(one.picture);
     const room = graph.rooms.find(({ id }) => id === one.room);
-    const relations = graph.relations.filter(({ a, b }) => a === one.id || b === one.id);
+    const relations = graph.relations.filter(({ subject, other }) => [subject, other].includes(one.id));
     const sides = one.box[1].map((v, i) => metres((v - (one.box[0][i] ?? v)) * unit));
     return html`
-      ${heading(titleOf(one), html`<span class="mark ${one.present ? "good" : "hollow"}">${one.present ? "there" : "gone"}</span> <span>${one.id}</span>`, true)}
+      ${heading(titleOf(one), html`<span class="mark ${one.there ? "good" : "hollow"}">${one.there ? "there" : "gone"}</span> <span>${one.id}</span>`, true)}
       <div class="body">
         ${picture ? html`<img class="picture" src=${picture} alt="Picture of ${titleOf(one)}" />` : nothing}
         <section class="row">
@@ -101,7 +101,7 @@ export class Thing extends Panel {
                 : nothing
             }
             <dt>Seen</dt>
-            <dd>${plural(one.num_sightings, "time")}</dd>
+            <dd>${plural(one.seen, "time")}</dd>
             <dt>First seen</dt>
             <dd>${day(one.first_seen)}</dd>
             <dt>Last seen</dt>
@@ -113,7 +113,9 @@ export class Thing extends Panel {
             ? html`<section>
                 <h3>How it stands to others</h3>
                 <ul>
-                  ${relations.map(({ a, b, kind }) => html`<li class="anywhere">${named(a)} ${kind} ${named(b)}</li>`)}
+                  ${relations.map(
+                    (row) => html`<li class="anywhere">${named(row.subject)} ${row.relation} ${named(row.other)}</li>`,
+                  )}
                 </ul>
               </section>`
             : nothing
@@ -144,8 +146,8 @@ export class Thing extends Panel {
   }
 
   private photo(one: PhotoEntry) {
-    const [fx, , ,] = one.intrinsics;
-    const wide = (2 * Math.atan(one.size[0] / (2 * fx)) * 180) / Math.PI;
+    const [fx, , ,] = one.intrinsics_px;
+    const wide = (2 * Math.atan(one.size_px[0] / (2 * fx)) * 180) / Math.PI;
     const at = [0, 1, 2].map((r) => one.T_map_camera[r]?.[3] ?? 0) as Vector;
     return html`
       ${heading(one.file, "photograph, localised", true)}
@@ -166,7 +168,7 @@ export class Thing extends Panel {
             <dt>Taken on</dt>
             <dd>${moment(one.captured_at)}</dd>
             <dt>Picture</dt>
-            <dd>${one.size.join(" × ")}</dd>
+            <dd>${one.size_px.join(" × ")}</dd>
             <dt>Angle of view</dt>
             <dd>${wide.toFixed(0)}° wide</dd>
           </dl>

@@ -121,7 +121,7 @@ export class Things extends Panel {
     const leave = () => actions.hover(null);
     return html`<span
       role="gridcell"
-      class="wide ${one.present ? "" : "off"}"
+      class="wide ${one.there ? "" : "off"}"
       @pointerenter=${hover}
       @pointerleave=${leave}
       @focusin=${hover}
@@ -136,7 +136,7 @@ export class Things extends Panel {
         <span class="detail">${sizeOf(one, unit)}</span>
         <span class="detail"
           ><span>${one.room ?? ""}</span
-          ><span>${one.present ? (one.last_seen ? day(one.last_seen) : nothing) : "gone"}</span></span
+          ><span>${one.there ? (one.last_seen ? day(one.last_seen) : nothing) : "gone"}</span></span
         >
       </button></span
     >`;
@@ -146,7 +146,7 @@ export class Things extends Panel {
     html`<span role="gridcell" class="wide"
       ><button class="choose" title=${one.file} @click=${() => actions.select({ kind: "photo", key: one.file })}>
         <span class="name">${one.file}</span>
-        <span class="detail"><span>${one.size.join(" × ")}</span><span>${day(one.captured_at)}</span></span>
+        <span class="detail"><span>${one.size_px.join(" × ")}</span><span>${day(one.captured_at)}</span></span>
       </button></span
     >`;
 }

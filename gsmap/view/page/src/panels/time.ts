@@ -93,28 +93,28 @@ export class Time extends Panel {
   private revisions() {
     const { state } = this;
     const rows = (state.map?.revisions ?? [])
-      .filter((row) => row.poses !== null || row.id === state.map?.revision)
-      .sort((a, b) => a.id - b.id);
+      .filter((row) => row.poses !== null || row.number === state.map?.revision)
+      .sort((a, b) => a.number - b.number);
     if (!rows.length)
       return html`<section>
         <h3>Poses by revision</h3>
         <p class="muted">No revision yet: optimize makes the first.</p>
       </section>`;
     const last = rows.length - 1;
-    const at = state.revision === null ? last : rows.findIndex((row) => row.id === state.revision);
+    const at = state.revision === null ? last : rows.findIndex((row) => row.number === state.revision);
     const row = rows[at];
     if (!row) return nothing;
     const known = actions.posesOf(state);
-    const go = (index: number) => actions.revision(rows[Math.max(0, Math.min(last, index))]?.id ?? null);
+    const go = (index: number) => actions.revision(rows[Math.max(0, Math.min(last, index))]?.number ?? null);
     return html`<section>
       <h3 id="revisions">Poses by revision</h3>
-      ${this.slider("revision", "revisions", at, last, `revision ${row.id} of ${moment(row.created_at)}`, go)}
+      ${this.slider("revision", "revisions", at, last, `revision ${row.number} of ${moment(row.created_at)}`, go)}
       <p class="said">
-        <strong>Revision ${row.id}${at === last ? ", the newest" : ""}</strong
+        <strong>Revision ${row.number}${at === last ? ", the newest" : ""}</strong
         ><span class="muted">${moment(row.created_at)}</span>
       </p>
       <p class="muted small figures">
-        ${plural(row.num_scenes, "scene")}, ${plural(row.num_edges_used, "edge")} used
+        ${plural(row.scenes, "scene")}, ${plural(row.edges_used, "edge")} used
         ${known?.status === "loading" ? html`<span class="waiting"></span>` : nothing}
       </p>
       ${
@@ -159,7 +159,8 @@ export class Time extends Panel {
     const ofComponent = map.changes.filter((one) => one.component === state.component);
     const chosen = state.selection?.kind === "change" ? state.selection.key : null;
     const count = (name: ChangeFilter) =>
-      ofComponent.filter((one) => (name === "all" || one.status === name) && derive.isBy(one.at, state.until)).length;
+      ofComponent.filter((one) => (name === "all" || one.status === name) && derive.isBy(one.newer_at, state.until))
+        .length;
     return html`<section>
       <h3>What changed</h3>
       ${
@@ -269,7 +270,7 @@ export class Time extends Panel {
 
   private readonly row = (change: ChangeEntry) => {
     const { map } = this.state;
-    const [before, after] = [map?.scenes[change.before], map?.scenes[change.after]];
+    const [before, after] = [map?.scenes[change.older], map?.scenes[change.newer]];
     return html`<span
       role="gridcell"
       class="wide"

@@ -827,8 +827,8 @@ const cornerOf = ([low, high]: Box, k: number) =>
 
 function photoLines(photo: PhotoEntry, depth: number): number[] {
   const pose = new Matrix4().set(...(photo.T_map_camera.flat() as Sixteen));
-  const [fx, fy, cx, cy] = photo.intrinsics;
-  const [w, h] = photo.size;
+  const [fx, fy, cx, cy] = photo.intrinsics_px;
+  const [w, h] = photo.size_px;
   const corner = (x: number, y: number): Vector => [((x - cx) / fx) * depth, ((y - cy) / fy) * depth, depth];
   return frustumLines([[0, 0, 0], corner(0, 0), corner(w, 0), corner(w, h), corner(0, h)], pose);
 }
