@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,6 +13,9 @@ _CATEGORIES = ("Cc", "Cs", "Zl", "Zp")
 # two joiners that scripts and emoji need.
 _INVISIBLE = "Cf"
 _JOINERS = frozenset("\u200c\u200d")
+_DIGESTS = {"id", "scene", "target", "source", "sha256", "key", "descriptor_id"}
+_DIGEST = re.compile(r"[0-9a-f]{32,64}")
+_SHORT = 12  # digits of a digest that tell a map's things apart
 
 
 def control_characters(text: str, *, lines: bool = False) -> list[str]:
@@ -61,6 +65,16 @@ def shown(value: Any, *, lines: bool = False) -> str:
     if isinstance(value, (list, tuple)):
         return ", ".join(shown(item, lines=lines) for item in value)
     return escaped(str(value), lines=lines)
+
+
+def cell_text(name: str, value: Any) -> str:
+    """Format a field for a table on a terminal or in a notebook, with digests shortened."""
+    return short(value) if name in _DIGESTS else shown(value)
+
+
+def short(value: Any) -> str:
+    """Format a value like `shown`, with digests shortened."""
+    return value[:_SHORT] if isinstance(value, str) and _DIGEST.fullmatch(value) else shown(value)
 
 
 def _steers(c: str) -> bool:

@@ -201,7 +201,7 @@ def print_table(title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> 
     left out, which a note says. ``--wide`` prints all columns at full width. A pipe or file gets lines of values
     separated by tabs, headings first; before each table but the first an empty line and ``# title``.
     """
-    from gsmap.types.notebook import cell_text
+    from gsmap.texts import cell_text
 
     global _has_printed_table
 

@@ -5,7 +5,7 @@ browser load nothing. `gsmap.map.report.builder` collects the content.
 """
 
 from gsmap.report.content import EdgeEntry, Island, PoseDifferences, Report, SceneEntry
-from gsmap.report.page import SECTIONS, owner_of, page
+from gsmap.report.page import SECTIONS, owner_mark, owner_of, page
 from gsmap.report.params import Params
 from gsmap.report.plan import Plan, PlanEdge, PlanScene, make_plan
 from gsmap.report.top import density_picture, top_picture
@@ -23,6 +23,7 @@ __all__ = [
     "PlanScene",
     "density_picture",
     "make_plan",
+    "owner_mark",
     "owner_of",
     "page",
     "top_picture",

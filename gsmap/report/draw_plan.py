@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsmap.geometry.uncertainty import largest_sigma
+from gsmap.markup import Markup, joined, tag
 from gsmap.report import svg
-from gsmap.report.markup import Markup, joined, tag
 from gsmap.report.plan import Plan
 from gsmap.report.top import data_address
 from gsmap.report.words import cut, length

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import re
 from collections.abc import Callable, Sequence
 from importlib import resources
@@ -11,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gsmap.markup import Markup, Part, joined, policy_meta, source_of, tag
 from gsmap.report import plots
 from gsmap.report.content import EdgeEntry, Island, PoseDifferences, Report
 from gsmap.report.draw_plan import draw_plan
-from gsmap.report.markup import Markup, Part, joined, tag
 from gsmap.report.top import data_address, picture_webp
 from gsmap.report.words import (
     angle,
@@ -55,20 +53,20 @@ def page(report: Report) -> str:
     allowed by its digest, and pictures are embedded.
     """
     style = resources.files("gsmap.report").joinpath("style.css").read_text(encoding="utf-8")
-    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
-    policy = f"default-src 'none'; style-src 'sha256-{digest}'; img-src data:; base-uri 'none'; form-action 'none'"
+    policy = {"default-src": "'none'", "style-src": source_of(style), "img-src": "data:"}
+    policy |= {"base-uri": "'none'", "form-action": "'none'"}
     sections = [(name, title, content) for name, (title, make) in SECTIONS.items() if (content := make(report))]
     head = tag(
         "head",
         tag("meta", charset="utf-8"),
-        tag("meta", http_equiv="Content-Security-Policy", content=policy),
+        policy_meta(policy),
         tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
         tag("meta", name="color-scheme", content="light dark"),
         tag("meta", name="referrer", content="no-referrer"),
         tag("meta", name="generator", content=f"gsmap {report.version}"),
-        tag("meta", name="gsmap-map", content=report.map_id),
+        owner_mark(report.map_id),
         tag("title", f"{report.title}: map report"),
-        Markup(f"<style>{style}</style>"),  # allowed by its digest in the policy
+        tag("style", Markup(style)),
     )
     links = [tag("a", title, href=f"#{name}") for name, title, _ in sections]
     body = tag(
@@ -81,8 +79,13 @@ def page(report: Report) -> str:
     return "<!doctype html>\n" + tag("html", head, body, lang="en").html + "\n"
 
 
+def owner_mark(map_id: str) -> Markup:
+    """Return the element of the head by which `owner_of` recognizes a page of a map."""
+    return tag("meta", name="gsmap-map", content=map_id)
+
+
 def owner_of(path: Path) -> str | None:
-    """Return the id of the map of a report file; None if the file is not a report."""
+    """Return the id of the map of a report or a page in one file; None for another file."""
     if not path.is_file():  # opening a pipe would wait for its writer
         return None
     try:

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gsmap.markup import Markup, joined, tag
 from gsmap.report import svg
 from gsmap.report.content import CHI2_95, CHI2_999, CHI2_DOF, EdgeEntry, SceneEntry
-from gsmap.report.markup import Markup, joined, tag
 from gsmap.report.svg import Axis, Frame
 from gsmap.report.words import NOT_PULLED, cut, cut_pair, length, number
 from gsmap.types.rows.revisions import RevisionRow

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.report.markup import Markup, Part, tag
+from gsmap.markup import Markup, Part, tag
 
 WIDTH = 470.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52.0, 14.0, 12.0, 40.0

@@ -2,52 +2,39 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
-from html import escape
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-from gsmap.texts import shown
+from gsmap.markup import Markup, joined, tag
+from gsmap.texts import cell_text, short, shown
 
 _MAX_LINES = 60  # of a table: the rest is counted
-_DIGESTS = {"id", "scene", "target", "source", "sha256", "key", "descriptor_id"}
-_DIGEST = re.compile(r"[0-9a-f]{32,64}")
-_SHORT = 12  # digits of a digest that tell a map's things apart
 
 
-def cell_text(name: str, value: Any) -> str:
-    """Format a field for a table on a terminal or in a notebook, with digests shortened."""
-    return short(value) if name in _DIGESTS else shown(value)
-
-
-def short(value: Any) -> str:
-    """Format a value like `shown`, with digests shortened."""
-    return value[:_SHORT] if isinstance(value, str) and _DIGEST.fullmatch(value) else shown(value)
-
-
-def html_table(columns: Mapping[str, str], rows: Sequence[Any]) -> str:
-    """Format the named fields of rows (``columns``: field to heading) as an HTML table."""
-    head = "".join(f"<th>{escape(heading)}</th>" for heading in columns.values())
-    lines = (
-        "".join(_cell(cell_text(name, getattr(row, name)), getattr(row, name)) for name in columns)
+def html_table(rows: Sequence[Any]) -> str:
+    """Format the columns of rows as an HTML table."""
+    if not rows:
+        return tag("p", "none").html
+    columns, more = rows[0].columns, len(rows) - _MAX_LINES
+    head = tag("thead", tag("tr", [tag("th", heading) for heading in columns.values()]))
+    lines = [
+        tag("tr", [_cell(cell_text(name, getattr(row, name)), getattr(row, name)) for name in columns])
         for row in rows[:_MAX_LINES]
-    )
-    body = "".join(f"<tr>{line}</tr>" for line in lines)
-    more = f"<p>and {len(rows) - _MAX_LINES} more</p>" if len(rows) > _MAX_LINES else ""
-    table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-    return f'<div style="overflow-x:auto">{table}</div>{more}'
+    ]
+    table = tag("div", tag("table", head, tag("tbody", lines)), style="overflow-x:auto")
+    return joined(table, tag("p", f"and {more} more") if more > 0 else None).html
 
 
 def html_facts(title: str, facts: Iterable[tuple[str, Any]]) -> str:
     """Format facts as an HTML table with a title, one fact per line; leave out facts that are None or empty."""
-    lines = (
-        f"<tr>{_cell(shown(name), name)}{_cell(short(value), '')}</tr>"
+    lines = [
+        tag("tr", _cell(shown(name), name), _cell(short(value), ""))
         for name, value in facts
         if value is not None and shown(value) != ""
-    )
-    return f"<p><strong>{escape(shown(title))}</strong></p><table><tbody>{''.join(lines)}</tbody></table>"
+    ]
+    return joined(tag("p", tag("strong", shown(title))), tag("table", tag("tbody", lines))).html
 
 
-def _cell(text: str, value: Any) -> str:
+def _cell(text: str, value: Any) -> Markup:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return f'<td style="text-align:{"right" if is_number else "left"}">{escape(text)}</td>'
+    return tag("td", text, style=f"text-align:{'right' if is_number else 'left'}")

@@ -7,7 +7,6 @@ from typing import TypedDict
 
 import numpy as np
 
-from gsmap.types.notebook import html_facts
 from gsmap.types.thinning import Thinning
 
 SCALE_POLICIES = ("auto", "known", "unknown")
@@ -86,6 +85,8 @@ class Scene(SceneFacts):
         return f"Scene({self.name!r}, id={self.id[:12]!r}, {sizes}, extent={size}{dated})"
 
     def _repr_html_(self) -> str:
+        from gsmap.types.notebook import html_facts
+
         facts = {
             "id": self.id,
             "Gaussians": self.num_gaussians,

@@ -27,6 +27,7 @@ from gsmap.errors import (
     NotFoundError,
     ReadOnlyError,
 )
+from gsmap.markup import policy_text
 from gsmap.view.answers import Answer, Answers
 from gsmap.view.built import built_page
 from gsmap.view.connections import LocalServer
@@ -37,9 +38,7 @@ from gsmap.view.site import CSP
 from gsmap.view.tree_cache import TreeCache
 
 _SECURITY = {
-    "Content-Security-Policy": "; ".join(
-        f"{name} {value}" for name, value in (CSP | {"frame-ancestors": "'none'"}).items()
-    ),
+    "Content-Security-Policy": policy_text(CSP | {"frame-ancestors": "'none'"}),
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",

@@ -22,6 +22,7 @@ import numpy as np
 
 from gsmap.errors import CorruptError, GsmapError, InputError, NotFoundError
 from gsmap.formats.tiles3d import CONTENT_FOLDER
+from gsmap.markup import Markup, joined, policy_meta, source_of, tag
 from gsmap.types.progress import Progress
 from gsmap.view.answers import Answers, jpeg
 from gsmap.view.content import ServerState, ViewMap, ViewOverview, summary
@@ -224,7 +225,7 @@ def write_page(
     page: Path,
     max_bytes: int,
     progress: Progress,
-    mark: str = "",
+    mark: Markup | None = None,
 ) -> SiteContents:
     """Write the page with its map as one HTML file.
 
@@ -235,7 +236,7 @@ def write_page(
         page: Folder of the built page.
         max_bytes: Maximum size of the levels of detail in bytes; base64 text takes a third more.
         progress: Callback of the progress.
-        mark: HTML for the head, by which the file is recognized.
+        mark: Element of the head by which the file is recognized.
     """
     view, maker = page_source.content(), _Maker(page_source, levels, params, progress)
     files: dict[str, bytes] = {}
@@ -315,7 +316,7 @@ def _cut(tile: dict[str, Any], kept: set[str]) -> dict[str, Any]:
     return rest | ({"children": children} if children else {})
 
 
-def _one_file(page: Path, files: Mapping[str, bytes], mark: str) -> str:
+def _one_file(page: Path, files: Mapping[str, bytes], mark: Markup | None) -> str:
     """Return the page as one text, with style, script and all files embedded."""
     html = (page / "index.html").read_text(encoding="utf-8")
     script, style = _SCRIPT.search(html), _STYLE.search(html)
@@ -327,40 +328,34 @@ def _one_file(page: Path, files: Mapping[str, bytes], mark: str) -> str:
     code = (page / script[1]).read_text(encoding="utf-8").replace("</script", "<\\/script").replace("<!--", "<\\!--")
     packed = {address: base64.b64encode(data).decode() for address, data in files.items()}
     data = json.dumps(packed).replace("<", "\\u003c")
-    inside = (
-        f'<script id="gsmap-files" type="application/json">{data}</script>'
-        f"<script>{_EMBEDDED}</script>"
-        f'<script type="module">{code}</script>'
+    inside = joined(
+        tag("script", Markup(data), id="gsmap-files", type="application/json"),
+        tag("script", Markup(_EMBEDDED)),
+        tag("script", Markup(code), type="module"),
     )
     html = html[: script.start()] + html[script.end() :]
     text = ""
     if style is not None:
         text = (page / style[1]).read_text(encoding="utf-8").replace("</style", "<\\/style")
-        html = html.replace(style[0], f"<style>{text}</style>")
+        html = html.replace(style[0], tag("style", Markup(text)).html)
     end = html.rindex("</body>")
-    html = html[:end] + inside + html[end:]
+    html = html[:end] + inside.html + html[end:]
     policy = CSP | {
-        "script-src": f"{_hash(_EMBEDDED)} {_hash(code)} 'wasm-unsafe-eval'",
+        "script-src": f"{source_of(_EMBEDDED)} {source_of(code)} 'wasm-unsafe-eval'",
         "connect-src": "'none'",
-        "style-src": _hash(text),
+        "style-src": source_of(text),
         "img-src": "data:",
     }
     return _with_policy(html, policy, mark)
 
 
-def _with_policy(html: str, policy: Mapping[str, str], mark: str = "") -> str:
-    content = "; ".join(f"{name} {value}" for name, value in policy.items())
+def _with_policy(html: str, policy: Mapping[str, str], mark: Markup | None = None) -> str:
     head = _HEAD.search(html)
     if head is None:
         raise GsmapError(
             "the page has no head element: build the page again (tools/build_page.sh)", code="page_not_built"
         )
-    meta = f'{mark}<meta http-equiv="Content-Security-Policy" content="{content}" />'
-    return html[: head.end()] + meta + html[head.end() :]
-
-
-def _hash(code: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}'"
+    return html[: head.end()] + joined(mark, policy_meta(policy)).html + html[head.end() :]
 
 
 def _merged(folder: Path) -> Iterator[tuple[str, Path]]:

@@ -22,7 +22,7 @@ SOURCES = {"gsmap": ROOT / "gsmap", "gsmap_synthetic": ROOT / "synthetic" / "gsm
 LAYERS = [
     {"version", "platform"},
     {"reason_codes", "errors", "texts"},
-    {"durable"},
+    {"durable", "markup"},
     {"types"},
     {"geometry"},
     {"methods"},

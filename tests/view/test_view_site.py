@@ -9,6 +9,7 @@ import json
 import re
 import threading
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from view_room import A, B, C, MadeDoors, blob, page_folder
 
 from gsmap.errors import GsmapError, InputError, NotFoundError
 from gsmap.formats import spz
+from gsmap.markup import tag
 from gsmap.view import Params
 from gsmap.view.built import built_page
 from gsmap.view.levels import Levels
@@ -100,7 +102,7 @@ def test_every_address_is_a_file_and_none_is_of_this_machine(page_source, levels
         if path.is_file():
             assert str(tmp_path).encode() not in path.read_bytes()
     html = (out / "index.html").read_text()
-    assert "script-src 'self' 'wasm-unsafe-eval'" in html
+    assert "script-src 'self' 'wasm-unsafe-eval'" in unescape(html)
 
 
 def test_pictures_of_a_static_page_are_bounded(page_source, levels, tmp_path):
@@ -153,7 +155,7 @@ def inside(path: Path) -> dict[str, bytes]:
 
 def test_one_file_holds_as_much_of_every_tree_as_fits(page_source, levels, tmp_path):
     path, page = tmp_path / "map.html", page_folder(tmp_path)
-    write_page(path, page_source, levels, PARAMS, page, 10_000_000, silent, mark='<meta name="x" content="y">')
+    write_page(path, page_source, levels, PARAMS, page, 10_000_000, silent, mark=tag("meta", name="x", content="y"))
     whole = inside(path)
     small_path = tmp_path / "small.html"
     write_page(small_path, page_source, levels, PARAMS, page, 30_000, silent)

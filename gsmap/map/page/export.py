@@ -30,7 +30,7 @@ from gsmap.errors import MALFORMED, ConfigError, CorruptError, NotFoundError
 from gsmap.map.page.source import MapPageSource, cache_folder
 from gsmap.map.pictures.comparison_pictures import note_target
 from gsmap.map.settings import Settings
-from gsmap.report import owner_of
+from gsmap.report import owner_mark, owner_of
 from gsmap.store import Store
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.maps import ViewReport
@@ -93,7 +93,6 @@ def write_page(store: Store, settings: Settings, path: Path, megabytes: float, p
     made: list[site.SiteContents] = []
     told = partial(progress, "page")
     with _levels(page_source, settings) as levels:
-        mark = f'<meta name="gsmap-map" content="{store.id}">'  # by which a purge knows it (`gsmap.report.owner_of`)
         write = partial(
             site.write_page,
             page_source=page_source,
@@ -102,7 +101,7 @@ def write_page(store: Store, settings: Settings, path: Path, megabytes: float, p
             page=page,
             max_bytes=int(megabytes * 1e6),
             progress=told,
-            mark=mark,
+            mark=owner_mark(store.id),
         )
         refused = None if is_stream(path) else note_target(store, path, {"page": True})
         write_output(path, lambda staged: made.append(write(staged)), store.id)

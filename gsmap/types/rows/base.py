@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 
 from gsmap.errors import MissingDependencyError
-from gsmap.types.notebook import html_facts, html_table, short
+from gsmap.texts import short
 from gsmap.types.plain import plain
 from gsmap.types.sim3 import Sim3
 
@@ -54,6 +54,8 @@ class Row:
         return f"{type(self).__name__}({shown})"
 
     def _repr_html_(self) -> str:
+        from gsmap.types.notebook import html_facts
+
         names = self.columns or {field.name: field.name for field in fields(self)}  # type: ignore[arg-type]
         return html_facts(type(self).__name__, [(heading, getattr(self, name)) for name, heading in names.items()])
 
@@ -108,7 +110,9 @@ class Table(list[R]):
         return "[" + ",\n ".join([*lines, *more]) + "]"
 
     def _repr_html_(self) -> str:
-        return html_table(self[0].columns, self) if self else "<p>none</p>"
+        from gsmap.types.notebook import html_table
+
+        return html_table(self)
 
 
 def coordinates(world: np.ndarray | None) -> str | None:

@@ -2,7 +2,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from gsmap.report.markup import Markup, joined, tag, text_markup
+from gsmap.markup import Markup, joined, tag, text_markup
 
 HOSTILE = [
     "<script>alert(1)</script>",

@@ -1,14 +1,14 @@
-"""HTML and SVG composed of elements, so that text of a map cannot become markup.
+"""Write HTML and SVG as elements, so that text of a map cannot become markup.
 
 Names, notes and reasons of a map are untrusted. All text passes `text_markup`, which escapes control and bidirectional
-characters (line feeds stay) and quotes HTML's special characters. Only `Markup` enters a page unchanged, and only
-`tag`, `text_markup` and `joined` create it.
+characters (line feeds stay) and quotes HTML's special characters. Only `Markup` enters a page unchanged: elements that
+this module creates, and scripts and style sheets of this package.
 """
 
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from gsmap.texts import escaped
@@ -52,6 +52,24 @@ def tag(name: str, /, *parts: Part | Iterable[Part], **attributes: object) -> Ma
     if name in _VOID:
         return Markup(f"<{name}{text}>")
     return Markup(f"<{name}{text}>{''.join(_html(parts))}</{name}>")
+
+
+def policy_text(policy: Mapping[str, str]) -> str:
+    """Return a Content-Security-Policy with these directives."""
+    return "; ".join(f"{name} {value}" for name, value in policy.items())
+
+
+def policy_meta(policy: Mapping[str, str]) -> Markup:
+    """Return the element that gives a page its Content-Security-Policy."""
+    return tag("meta", http_equiv="Content-Security-Policy", content=policy_text(policy))
+
+
+def source_of(text: str) -> str:
+    """Return the source by which a Content-Security-Policy allows a script or style sheet."""
+    import base64
+    import hashlib
+
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 def _html(parts: Iterable[Part | Iterable[Part]]) -> Iterable[str]:
