@@ -34,4 +34,6 @@ class Params:
     min_confidence: float = 0.5
 
     def __post_init__(self) -> None:
+        require_range(self, "[0, inf]", "min_area_m2")
+        require_range(self, "[0, 1]", "min_moved_fraction", "min_confidence")
         require_range(self, "(0, inf]", "longest_side_px", "max_views", "voxel_m")

@@ -21,6 +21,7 @@ from gsmap.describe.precision import round_graph
 from gsmap.describe.unit import VIEW_DISTANCE_M, estimate_unit_m, landmark_units, working_unit_m
 from gsmap.errors import ConfigError
 from gsmap.methods import RecipeKey
+from gsmap.settings.ranges import require_range
 from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph
 from gsmap.types.model import ModelSpec
 from gsmap.types.progress import Progress, silent
@@ -56,6 +57,10 @@ class Params:
     view_distance_m: float = VIEW_DISTANCE_M
     landmark: LandmarkParams = field(default_factory=LandmarkParams)
     object: ObjectParams = field(default_factory=ObjectParams)
+
+    def __post_init__(self) -> None:
+        require_range(self, "[0, 1]", "min_opacity")
+        require_range(self, "(0, inf]", "view_distance_m")
 
 
 def recipe_key(params: Params | None = None, models: Mapping[str, ModelSpec] | None = None) -> RecipeKey:

@@ -42,6 +42,7 @@ class Params:
     levels: levels.Params = field(default_factory=levels.Params)
 
     def __post_init__(self) -> None:
+        require_range(self, "[0, inf]", "max_tiles", "max_shared_bytes")
         require_range(self, "[0, inf]", "max_shift_m")
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from gsmap.errors import InputError, MissingDependencyError, NotFoundError
 from gsmap.geometry.camera_models import require_pycolmap
 from gsmap.localize.photos import Lens, make_photo
+from gsmap.settings.ranges import require_range
 from gsmap.types.localization import Photo
 
 _MAX_FRAME_PX = 35_651_584  # 8192 x 4352, the largest frame that H.264, H.265 and AV1 allow (level 6.2)
@@ -32,6 +33,11 @@ class Params:
     interval_s: float = 0.5
     max_frames: int = 40
     max_side_px: int = 1280
+
+    def __post_init__(self) -> None:
+        require_range(self, "(0, inf]", "interval_s")
+        require_range(self, "[1, inf]", "max_frames")
+        require_range(self, "[64, inf]", "max_side_px")
 
 
 def read_clip(

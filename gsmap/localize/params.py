@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from gsmap.errors import ConfigError
 from gsmap.localize import clips, verdict, views
 from gsmap.methods import MethodParams, family
+from gsmap.settings.ranges import require_range
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,6 @@ class Params:
     clips: clips.Params = field(default_factory=clips.Params)
 
     def __post_init__(self) -> None:
+        require_range(self, "[1, inf]", "max_views", "max_candidates")
+        require_range(self, "[0, 1]", "min_change_fraction")
         family("extractor").get(self.extractor)
-        if not (self.max_views >= 1 and self.max_candidates >= 1):
-            raise ConfigError(
-                f"max_views and max_candidates must be at least 1, got {self.max_views} and {self.max_candidates}",
-                code="out_of_range",
-            )

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsmap.errors import ConfigError
 from gsmap.formats.scans import Params as ReadingParams
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.neighbours import chunks_of_neighbours
 from gsmap.geometry.rotations import matrices_to_quats
 from gsmap.geometry.sh import sh0_of_rgb
+from gsmap.settings.ranges import require_range
 from gsmap.types import Gaussians
 from gsmap.types.scan import Scan
 
@@ -49,10 +49,7 @@ class Params:
     reading: ReadingParams = field(default_factory=ReadingParams)
 
     def __post_init__(self) -> None:
-        for one in fields(self):
-            value = getattr(self, one.name)
-            if one.name != "reading" and not value > 0:
-                raise ConfigError(f"scan.{one.name} must be positive, got {value}", code="out_of_range")
+        require_range(self, "(0, inf]", "cell_m", "max_scenes_by_shape")
 
 
 def as_gaussians(scan: Scan, cell: float, max_points: int = MAX_POINTS) -> Gaussians:

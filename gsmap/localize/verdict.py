@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.errors import ConfigError
 from gsmap.localize.probability import PRIOR, load_model
 from gsmap.reason_codes import reason
+from gsmap.settings.ranges import require_range
 
 MIN_INLIERS = 1
 """Smallest number of tracked patches that must lie where the pose predicts them."""
@@ -40,10 +40,9 @@ class Params:
     max_translation_sigma_m: float = 0.25
 
     def __post_init__(self) -> None:
-        if not 0 <= self.aliased_prior < 1 - PRIOR:
-            raise ConfigError(
-                f"aliased_prior must lie in [0, {1 - PRIOR:g}), got {self.aliased_prior}", code="out_of_range"
-            )
+        require_range(self, "[0, 1]", "min_probability", "max_rival_probability")
+        require_range(self, "(0, inf]", "max_rotation_sigma_deg", "max_translation_sigma_m")
+        require_range(self, f"[0, {1 - PRIOR:g})", "aliased_prior")
 
 
 def rejection_reason(

@@ -8,6 +8,7 @@ import numpy as np
 
 from gsmap.geometry.camera_synthesis import synthesise_cameras
 from gsmap.geometry.projection import in_image, project
+from gsmap.settings.ranges import require_range
 from gsmap.types import Cameras, Gaussians
 
 _TURN_FRACTION = 0.6  # a shift by this share of the median content distance changes a view as much as a radian
@@ -35,6 +36,11 @@ class Params:
     max_own_views: int = 24
     max_synthetic_views: int = 8
     max_features: int = 600
+
+    def __post_init__(self) -> None:
+        require_range(self, "[64, inf]", "image_size_px")
+        require_range(self, "[0, inf]", "max_own_views", "max_synthetic_views")
+        require_range(self, "[1, inf]", "max_features")
 
 
 def select_views(gaussians: Gaussians, cameras: Cameras, params: Params | None = None) -> Cameras:

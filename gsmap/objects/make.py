@@ -23,6 +23,7 @@ from gsmap.objects.component_scenes import (
 from gsmap.objects.outlines import Outline, measure_outlines
 from gsmap.objects.regroup import Group, regroup
 from gsmap.objects.visibility import LONGEST_SIDE_PX, MAX_VIEWS, RenderedViews, classify_observation, observe_points
+from gsmap.settings.ranges import require_range
 from gsmap.types import MapObject, ObjectObservation, ObservationState
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
@@ -54,6 +55,11 @@ class Params:
     max_views: int = MAX_VIEWS
     longest_side_px: int = LONGEST_SIDE_PX
     min_room_area_m2: float = 1.5
+
+    def __post_init__(self) -> None:
+        require_range(self, "[0, inf]", "min_gaussians", "min_room_area_m2")
+        require_range(self, "[0, 1]", "min_overlap")
+        require_range(self, "[1, inf]", "max_views", "longest_side_px")
 
 
 def recipe_key(params: Params | None = None) -> RecipeKey:

@@ -10,6 +10,7 @@ import numpy as np
 
 from gsmap.errors import ConfigError
 from gsmap.register.correspondences import Correspondences
+from gsmap.settings.ranges import require_range
 
 Test = Literal["absolute", "ratio"]
 
@@ -37,6 +38,7 @@ class Params:
     height_slope: float = 0.05
 
     def __post_init__(self) -> None:
+        require_range(self, "[0, inf]", "height_slope")
         if self.test not in get_args(Test):
             raise ConfigError(
                 f"the consistency test must be one of {', '.join(get_args(Test))}, got {self.test!r}",

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsmap.settings.ranges import require_range
 from gsmap.types import NodeLayer
 
 _LLOYD_STEPS = 10  # of spherical k-means; 5 and 20 steps give the same recall on synthetic places
@@ -28,6 +29,9 @@ class Params:
     """
 
     hops: int = 1
+
+    def __post_init__(self) -> None:
+        require_range(self, "[1, inf]", "hops")
 
 
 def add_context(

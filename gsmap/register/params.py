@@ -8,6 +8,7 @@ from typing import Literal, get_args
 from gsmap.errors import ConfigError
 from gsmap.methods import MethodParams, family
 from gsmap.register import evidence, verdict
+from gsmap.settings.ranges import require_range
 
 Fallback = Literal["auto", "never", "always"]
 
@@ -50,6 +51,7 @@ class Params:
     verdict: verdict.Params = field(default_factory=verdict.Params)
 
     def __post_init__(self) -> None:
+        require_range(self, "[1, inf]", "max_poses", "num_cameras")
         if self.fallback not in get_args(Fallback):
             raise ConfigError(
                 f"fallback must be one of {', '.join(get_args(Fallback))}, got {self.fallback!r}", code="invalid_choice"

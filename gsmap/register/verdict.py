@@ -9,6 +9,7 @@ import numpy as np
 from gsmap.reason_codes import reason
 from gsmap.register.evidence import PoseEvidence
 from gsmap.register.probability import probability, shortfalls
+from gsmap.settings.ranges import require_range
 from gsmap.types.registration import Proposal
 
 MAX_RUNNER_UP = 0.7  # with a larger rival clique (as a share of the best clique's size) a pose is not significant
@@ -41,12 +42,12 @@ class Params:
             larger value rejects more repainted places.
         min_probability: Smallest probability in [0, 1], given all evidence, that an accepted pose is correct; a larger
             value accepts fewer incorrect and fewer correct poses.
-        max_rotation_sigma_deg: Largest standard deviation of the rotation, in degrees, about its least certain axis
-            at the overlap's centroid; a larger value accepts less certain poses.
-        max_translation_sigma_m: Largest standard deviation of the translation, in metres, in its least certain
-            direction at the overlap's centroid; a larger value accepts less certain poses.
-        max_scale_sigma: Largest standard deviation of the logarithm of the scale; a larger value accepts less certain
-            scales.
+        max_rotation_sigma_deg: Largest standard deviation of the rotation, in degrees, positive, about its least
+            certain axis at the overlap's centroid; a larger value accepts less certain poses.
+        max_translation_sigma_m: Largest standard deviation of the translation, in metres, positive, in its least
+            certain direction at the overlap's centroid; a larger value accepts less certain poses.
+        max_scale_sigma: Largest standard deviation of the logarithm of the scale, positive; a larger value accepts less
+            certain scales.
     """
 
     max_log_nfa: float = -8.0
@@ -57,6 +58,13 @@ class Params:
     max_rotation_sigma_deg: float = 1.5
     max_translation_sigma_m: float = 0.05
     max_scale_sigma: float = 0.025
+
+    def __post_init__(self) -> None:
+        require_range(self, "[-inf, 0]", "max_log_nfa")
+        require_range(self, "[1, inf]", "min_coinciding")
+        require_range(self, "[0, 1]", "max_free_space_violation", "min_probability")
+        require_range(self, "[-1, 1]", "min_colour_correlation")
+        require_range(self, "(0, inf]", "max_rotation_sigma_deg", "max_translation_sigma_m", "max_scale_sigma")
 
 
 def is_significant(proposal: Proposal, params: Params | None = None) -> bool:

@@ -175,7 +175,12 @@ def _set(tree: Any, path: list[str], value: Any, name: str, root: Any) -> Any:
         return tree.with_params(path[0], new)
     cls: type = type(tree)
     made = {key: vars(tree)[key] for key in _names(cls) if key in vars(tree)}  # `replace` would make the others, too
-    return cls(**made | {path[0]: new})
+    try:
+        return cls(**made | {path[0]: new})
+    except ConfigError as error:
+        if error.code != "out_of_range":
+            raise
+        raise ConfigError(f"{name}: {error}", code=error.code) from None
 
 
 def _unknown(name: str, root: Any) -> ConfigError:
@@ -212,7 +217,7 @@ def _of_type(value: Any, annotation: Any, name: str) -> Any:
         if len(value) != len(inner):
             raise _wrong(value, annotation, name)
         return tuple(_of_type(item, kind, name) for item, kind in zip(value, inner, strict=True))
-    if annotation is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+    if annotation is float and isinstance(value, (int, float)) and not isinstance(value, bool) and value == value:
         try:
             return float(value)
         except OverflowError:  # an integer of more than 308 digits

@@ -183,7 +183,7 @@ def test_the_settings_of_a_map_hold_when_a_model_is_added(tmp_path):
             m.add_model("clip", path)
         assert m.model_rows() == []
     for name in ("model_time_s", "model_memory_mb"):
-        with raises(ConfigError, code="out_of_range", match="model_time_s and model_memory_mb"):
+        with raises(ConfigError, code="out_of_range", match=name):
             Params(**{name: 0})
 
 

@@ -128,7 +128,7 @@ def test_masks_of_low_confidence_make_no_objects():
     assert every.weights.min() < 0.8
     assert 0 < len(sure) < len(every)
     assert sure.weights.min() >= 0.9
-    assert len(layer(1.01)) == 0
+    assert len(layer(1.0)) == 0
 
 
 def test_auto_falls_back_to_the_built_in_ones_and_says_so():

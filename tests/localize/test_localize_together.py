@@ -156,26 +156,26 @@ def clip(path, images: np.ndarray, codec: str = "mpeg4", form: str | None = None
 
 def test_a_clip_gives_the_sharpest_frame_of_each_stretch(tmp_path) -> None:
     rng = np.random.default_rng(0)
-    images = np.full((20, 64, 96, 3), 128, np.uint8)
+    images = np.full((20, 128, 192, 3), 128, np.uint8)
     for sharp in (3, 12):
-        images[sharp] = rng.integers(0, 255, (64, 96, 3))
+        images[sharp] = rng.integers(0, 255, (128, 192, 3))
     clip(tmp_path / "a.mp4", images)
     frames = read_clip(tmp_path / "a.mp4", params=reading.Params(interval_s=1.0))
     assert [round(10 * at) for at, _ in frames] == [3, 12]
-    assert frames[0][1].size_px == (96, 64)
-    small = read_clip(tmp_path / "a.mp4", params=reading.Params(interval_s=1.0, max_side_px=48))
-    assert small[0][1].size_px == (48, 32)
+    assert frames[0][1].size_px == (192, 128)
+    small = read_clip(tmp_path / "a.mp4", params=reading.Params(interval_s=1.0, max_side_px=96))
+    assert small[0][1].size_px == (96, 64)
 
 
 def test_intrinsics_of_a_clip_are_in_its_own_pixels(tmp_path) -> None:
-    clip(tmp_path / "a.mp4", np.full((3, 64, 96, 3), 128, np.uint8))
+    clip(tmp_path / "a.mp4", np.full((3, 128, 192, 3), 128, np.uint8))
     fisheye = ("OPENCV_FISHEYE", (90.0, 80, 50, 30, 0.02, 0, 0, 0))
     for lens, want in (
         (Lens((90.0, 80.0, 50.0, 30.0)), [45, 40, 25, 15]),
-        (Lens(focal_px=90.0), [45, 45, 24, 16]),
+        (Lens(focal_px=90.0), [45, 45, 48, 32]),
         (Lens(model=fisheye), [45, 40, 25, 15]),
     ):
-        ((_, photo),) = read_clip(tmp_path / "a.mp4", lens, reading.Params(max_side_px=48))
+        ((_, photo),) = read_clip(tmp_path / "a.mp4", lens, reading.Params(max_side_px=96))
         np.testing.assert_allclose(photo.intrinsics_px, want)
 
 

@@ -59,8 +59,10 @@ def test_every_setting_of_the_default_recipe_changes_its_key():
 def _other(value):
     if isinstance(value, bool):
         return not value
-    if isinstance(value, (int, float)):
+    if isinstance(value, int):
         return value + 1
+    if isinstance(value, float):
+        return 0.9 * value or 0.5
     if isinstance(value, tuple) and value and not isinstance(value[0], str):
         return (*value, value[-1])
     return None

@@ -70,6 +70,7 @@ def test_a_method_that_cannot_be_loaded_does_not_hinder_the_settings_of_another(
         ("loud", 1, "invalid_setting_value", "loud takes bool, got 1"),
         ("bars.near_m", "wide", "invalid_setting_value", "bars.near_m takes float, got 'wide'"),
         ("bars.near_m", None, "invalid_setting_value", "bars.near_m takes float, got None"),
+        ("bars.near_m", float("nan"), "invalid_setting_value", "bars.near_m takes float, got nan"),
         ("budget_s", "long", "invalid_setting_value", r"budget_s takes float \| None, got 'long'"),
         ("mode", "quick", "invalid_choice", "mode must be one of slow, fast, got 'quick'"),
         ("weights", [1.0], "invalid_setting_value", r"weights takes .*got \[1\.0\]"),

@@ -19,6 +19,7 @@ from gsmap.describe.landmarks.context import (
 from gsmap.describe.landmarks.detect import MAX_PER_OCTAVE, OctaveCache, find_blobs
 from gsmap.geometry.directions import level_frame
 from gsmap.methods import RecipeKey
+from gsmap.settings.ranges import require_range
 from gsmap.types import NodeLayer
 from gsmap.types.plain import plain
 from gsmap.types.views import PointCloud
@@ -39,6 +40,9 @@ class Params:
 
     max_per_octave: int = MAX_PER_OCTAVE
     use_fitted_metric: bool = False
+
+    def __post_init__(self) -> None:
+        require_range(self, "[1, inf]", "max_per_octave")
 
 
 def settings(params: Params) -> dict[str, Any]:

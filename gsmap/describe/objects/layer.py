@@ -15,6 +15,7 @@ from gsmap.errors import ConfigError
 from gsmap.geometry.directions import level_frame
 from gsmap.methods import Family, MethodParams, RecipeKey, family
 from gsmap.render import backend
+from gsmap.settings.ranges import require_range
 from gsmap.types import Cameras, Gaussians, NodeLayer
 from gsmap.types.model import ModelLimits, ModelSpec
 from gsmap.types.plain import plain
@@ -78,12 +79,9 @@ class Params:
     model_memory_mb: int = ModelLimits.memory_mb
 
     def __post_init__(self) -> None:
-        if not (self.model_time_s > 0 and self.model_memory_mb > 0):
-            raise ConfigError(
-                "model_time_s and model_memory_mb of describe.object must be positive, got "
-                f"{self.model_time_s} and {self.model_memory_mb}",
-                code="out_of_range",
-            )
+        require_range(self, "[1, inf]", "num_cameras", "min_views")
+        require_range(self, "(0, inf]", "longest_side_px", "depth_tolerance", "model_time_s", "model_memory_mb")
+        require_range(self, "[0, 1]", "min_confidence")
         for kind, name in (("segmenter", self.segmenter), ("embedder", self.embedder)):
             if name != "auto":
                 family(kind).get(name)

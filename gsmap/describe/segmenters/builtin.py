@@ -14,6 +14,7 @@ import numpy as np
 from gsmap._native import graph_parts
 from gsmap.describe.cloud import downsample, local_planes
 from gsmap.geometry.neighbours import nearest_neighbours, nearest_of
+from gsmap.settings.ranges import require_range
 from gsmap.types.views import Mask, PointCloud, SceneContext, View
 
 VERSION = 2
@@ -35,6 +36,9 @@ class Params:
     """
 
     scale: float = 6.0
+
+    def __post_init__(self) -> None:
+        require_range(self, "(0, inf]", "scale")
 
 
 def make(context: SceneContext, params: Params) -> BuiltinSegmenter:

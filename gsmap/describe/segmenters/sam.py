@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.networks.session import misfit, open_session, run
+from gsmap.settings.ranges import require_range
 from gsmap.types.model import ModelSpec
 from gsmap.types.views import Mask, SceneContext, View
 
@@ -45,6 +46,10 @@ class Params:
 
     points_per_side: int = 16
     min_iou: float = 0.86
+
+    def __post_init__(self) -> None:
+        require_range(self, "[1, inf]", "points_per_side")
+        require_range(self, "[0, 1]", "min_iou")
 
 
 def make(context: SceneContext, params: Params) -> SamSegmenter:

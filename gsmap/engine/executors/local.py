@@ -13,7 +13,7 @@ from typing import Any
 from gsmap import platform
 from gsmap.engine.blas_threads import run_with_one_blas_thread
 from gsmap.engine.pool import Pool
-from gsmap.errors import ConfigError
+from gsmap.settings.ranges import require_range
 
 VERSION = 2
 
@@ -33,8 +33,7 @@ class Params:
     workers: int = 0
 
     def __post_init__(self) -> None:
-        if self.workers < 0:
-            raise ConfigError(f"the number of workers must not be negative, got {self.workers}", code="out_of_range")
+        require_range(self, "[0, inf]", "workers")
 
 
 class LocalWorkers:

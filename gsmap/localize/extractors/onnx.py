@@ -15,6 +15,7 @@ from PIL import Image
 
 from gsmap.errors import InputError
 from gsmap.networks.session import misfit, open_session, run
+from gsmap.settings.ranges import require_range
 from gsmap.types.localization import Keypoints
 from gsmap.types.model import ModelSpec
 
@@ -36,6 +37,9 @@ class Params:
 
     max_features: int = 1500
     min_score: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_range(self, "[1, inf]", "max_features")
 
 
 def make(models: Mapping[str, ModelSpec], params: Params) -> OnnxExtractor:

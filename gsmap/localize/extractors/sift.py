@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap._native import sift
+from gsmap.settings.ranges import require_range
 from gsmap.types.localization import Keypoints
 from gsmap.types.model import ModelSpec
 
@@ -40,6 +41,9 @@ class Params:
 
     max_features: int = 1500
     upsampled: bool = True
+
+    def __post_init__(self) -> None:
+        require_range(self, "[1, inf]", "max_features")
 
 
 def make(models: Mapping[str, ModelSpec], params: Params) -> SiftExtractor:

@@ -108,8 +108,8 @@ class Params:
         if self.steps is not None:
             require_range(self, "[0, inf]", "steps")
         require_range(self, "(0, inf]", "voxel_m", "longest_side_px", "max_views")
-        require_range(self, "[0, inf]", "max_passes", "halo_m", "min_weight", "huber_delta", "photo_weight")
-        require_range(self, "[0, 1]", "kept_fraction", "ssim_weight")
+        require_range(self, "[0, inf]", "max_passes", "halo_m", "photo_weight")
+        require_range(self, "[0, 1]", "kept_fraction", "ssim_weight", "min_weight", "huber_delta")
         require_range(self, "[0, 1)", "momentum")
 
 

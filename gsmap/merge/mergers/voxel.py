@@ -10,6 +10,7 @@ import numpy as np
 from gsmap.geometry.voxels import merge_groups, voxel_labels
 from gsmap.merge.changes import LOOKING_M, MIN_CAMERAS, Prefer, resolve_changes
 from gsmap.merge.overlap import concatenate_scenes
+from gsmap.settings.ranges import require_range
 from gsmap.types import MergeResult, PosedScene
 from gsmap.types.progress import Progress
 
@@ -31,6 +32,9 @@ class Params:
 
     voxel_m: float = 0.01
     prefer: Prefer = "both"
+
+    def __post_init__(self) -> None:
+        require_range(self, "(0, inf]", "voxel_m")
 
 
 def reach_m(params: Params) -> float:

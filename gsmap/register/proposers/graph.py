@@ -13,6 +13,7 @@ from gsmap.methods.proposer import Proposal, Scene
 from gsmap.register import a_contrario, consistency, context, correspondences, pose, scale_vote
 from gsmap.register.clique import maximum_clique
 from gsmap.register.correspondences import Correspondences
+from gsmap.settings.ranges import require_range
 from gsmap.types import NodeLayer, SceneGraph, Sim3
 
 VERSION = 3
@@ -63,6 +64,10 @@ class Params:
     consistency: consistency.Params = field(default_factory=consistency.Params)
     max_correspondences: int = correspondences.MAX_CORRESPONDENCES
     step_limit: int = 2_000_000
+
+    def __post_init__(self) -> None:
+        require_range(self, "[4, inf]", "max_correspondences")
+        require_range(self, "[1, inf]", "step_limit")
 
 
 def propose(target: Scene, source: Scene, params: Params | None = None, *, with_scale: bool = False) -> list[Proposal]:

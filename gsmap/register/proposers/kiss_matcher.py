@@ -9,6 +9,7 @@ import numpy as np
 from gsmap import platform
 from gsmap.errors import MissingDependencyError
 from gsmap.methods.proposer import Proposal, Scene
+from gsmap.settings.ranges import require_range
 from gsmap.types import Sim3
 
 VERSION = 1
@@ -30,6 +31,9 @@ class Params:
     """
 
     voxel_m: float = 0.15
+
+    def __post_init__(self) -> None:
+        require_range(self, "(0, inf]", "voxel_m")
 
 
 def propose(target: Scene, source: Scene, params: Params | None = None, *, with_scale: bool = False) -> list[Proposal]:

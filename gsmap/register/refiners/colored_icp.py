@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmap.errors import ConfigError
 from gsmap.geometry.rotations import retract
 from gsmap.geometry.umeyama import umeyama
 from gsmap.methods.refiner import Correspondences, Surface
 from gsmap.register.degeneracy import constrained_motions, point_information
 from gsmap.register.surface import PLANE_NEIGHBOURS
+from gsmap.settings.ranges import require_range
 from gsmap.types import Sim3
 
 VERSION = 5
@@ -44,8 +44,7 @@ class Params:
     colour_weight: float = 0.3
 
     def __post_init__(self) -> None:
-        if not self.colour_weight >= 0:
-            raise ConfigError(f"colour_weight must not be negative, got {self.colour_weight}", code="out_of_range")
+        require_range(self, "[0, inf]", "colour_weight")
 
 
 @dataclass(frozen=True)
