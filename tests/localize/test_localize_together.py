@@ -169,11 +169,11 @@ def test_a_clip_gives_the_sharpest_frame_of_each_stretch(tmp_path) -> None:
 
 def test_intrinsics_of_a_clip_are_in_its_own_pixels(tmp_path) -> None:
     clip(tmp_path / "a.mp4", np.full((3, 128, 192, 3), 128, np.uint8))
-    fisheye = ("OPENCV_FISHEYE", (90.0, 80, 50, 30, 0.02, 0, 0, 0))
+    fisheye = ("OPENCV_FISHEYE", (180.0, 160, 100, 60, 0.02, 0, 0, 0))
     for lens, want in (
-        (Lens((90.0, 80.0, 50.0, 30.0)), [45, 40, 25, 15]),
-        (Lens(focal_px=90.0), [45, 45, 48, 32]),
-        (Lens(model=fisheye), [45, 40, 25, 15]),
+        (Lens((180.0, 160.0, 100.0, 60.0)), [90, 80, 50, 30]),
+        (Lens(focal_px=180.0), [90, 90, 48, 32]),
+        (Lens(model=fisheye), [90, 80, 50, 30]),
     ):
         ((_, photo),) = read_clip(tmp_path / "a.mp4", lens, reading.Params(max_side_px=96))
         np.testing.assert_allclose(photo.intrinsics_px, want)

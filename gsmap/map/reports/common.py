@@ -38,12 +38,12 @@ class SceneMapping(dict[str, Any]):
 
 
 def up_directions(graphs: Iterable[StoredGraph], scenes: Iterable[Scene | SceneSummary]) -> dict[str, np.ndarray]:
-    """Return the up direction (3,) of scenes by id, in their own frames: that of the last graph in the list, or the
-    one kept when the scene was thinned. Scenes without a known direction are left out.
+    """Return the up direction (3,) of scenes by id, in their own frames: that of the last graph in the list that
+    knows it, or the one kept when the scene was thinned. Scenes without a known direction are left out.
     """
-    of_thinned = {scene.id: scene.thinning.up for scene in scenes if scene.thinning is not None}
-    chosen = of_thinned | {graph.scene: graph.up for graph in graphs}
-    return {scene: np.array(up, np.float64) for scene, up in chosen.items() if up is not None}
+    known = [(scene.id, scene.thinning.up) for scene in scenes if scene.thinning is not None]
+    known += [(graph.scene, graph.up) for graph in graphs]
+    return {scene: np.array(up, np.float64) for scene, up in known if up is not None}
 
 
 def refs(scenes: Iterable[str], name_of: Mapping[str, str]) -> tuple[SceneRef, ...]:
