@@ -60,9 +60,6 @@ def register_by_shape(target: SceneView, source: SceneView, params: Params | Non
         return Registration(target.id, source.id, "no_match", why, seconds=watch.seconds)
     scored = sorted(((probability(j.proposal, j.evidence, PRIOR), j) for j in evaluated), key=lambda s: -s[0])
     best, why = scored[0][1], _reason(scored, source, params.verdict)
-    information = None
-    if not why and best.covariance is not None:
-        information = np.linalg.inv(best.covariance)
     seen = best.evidence
     return Registration(
         target.id,
@@ -70,7 +67,7 @@ def register_by_shape(target: SceneView, source: SceneView, params: Params | Non
         "rejected" if why else "accepted",
         why,
         best.proposal.S_target_source,
-        None if information is None else 0.5 * (information + information.T),
+        best.information,
         num_inliers=best.proposal.num_inliers,
         overlap=seen.overlap,
         proposer=best.proposal.proposer,

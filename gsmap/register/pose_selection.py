@@ -56,6 +56,14 @@ class EvaluatedPose:
     strain: Strain | None = None
     similarity: float = float("nan")
 
+    @property
+    def information(self) -> np.ndarray | None:
+        """Return the inverse of the covariance; None if the covariance is unknown or has no bound."""
+        if self.covariance is None or not np.isfinite(self.covariance).all():
+            return None
+        information = np.linalg.inv(self.covariance)
+        return 0.5 * (information + information.T)
+
 
 def select_pose(
     target: SceneView,
@@ -108,10 +116,7 @@ def select_pose(
         why = reason("look_alike", f"two places that look alike ({alike:.0%}), or one place that was refurnished")
     elif not accepted and not verdict.has_low_nfa(best.proposal, params.verdict):
         status, why = "no_match", verdict.not_significant(best.proposal, params.verdict, best.flaw)
-    information = None
-    if accepted and status != "no_match" and best.covariance is not None:  # a person may confirm a refused pair
-        information = np.linalg.inv(best.covariance)
-        information = 0.5 * (information + information.T)
+    if accepted and status != "no_match":
         if best.decision is not None and best.decision.note:
             notes = (*notes, best.decision.note)
         if best.strain is not None:
@@ -120,7 +125,7 @@ def select_pose(
         status=status,
         reason=why,
         S_target_source=best.proposal.S_target_source if status != "no_match" else None,
-        information=information,
+        information=best.information if status != "no_match" else None,  # a person may confirm a rejected pair
         num_inliers=best.proposal.num_inliers,
         num_correspondences=best.proposal.num_correspondences,
         overlap=best.evidence.overlap,

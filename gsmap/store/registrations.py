@@ -377,7 +377,7 @@ class Registrations:
 
         Raises:
             NotFoundError: the pair was never registered.
-            InputError: there is no pose to confirm, or nothing to withdraw.
+            InputError: there is no pose to confirm, its uncertainty is unknown, or there is nothing to withdraw.
             ConfigError: an unknown review.
         """
         if review not in REVIEWS:
@@ -395,6 +395,12 @@ class Registrations:
                     f"{first} and {second} have no pose to confirm: "
                     f"{found.registration.reason or 'the registration found no pose'}",
                     code="no_pose_of_pair",
+                )
+            if review == "confirm" and found.registration.information is None:
+                raise InputError(
+                    f"the pose of {first} and {second} was rejected before its uncertainty was measured: "
+                    f"give a pose of your own with gsmap edge MAP {first}:{second}",
+                    code="no_uncertainty_of_pair",
                 )
             if review == "withdraw" and found.review is None and not found.manual:
                 raise InputError(

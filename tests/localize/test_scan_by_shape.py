@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from gsmap.localize.scan import as_gaussians
 from gsmap.register import SceneView, by_shape
 from gsmap.register.by_shape import register_by_shape
 from gsmap.register.evidence import PoseEvidence
+from gsmap.register.pose_selection import EvaluatedPose
 from gsmap.types import NodeLayer, SceneGraph, Sim3
 from gsmap.types.registration import Proposal
 from gsmap.types.scan import Scan
@@ -77,12 +77,12 @@ def test_a_shape_that_fits_twice_is_ambiguous(
 ) -> None:
     target, source, _ = pair
     covariance = np.eye(7) * 1e-8
-    twice = [SimpleNamespace(proposal=proposal(), evidence=SEEN, covariance=covariance) for _ in range(2)]
+    twice = [EvaluatedPose(proposal(), SEEN, covariance, flaw="") for _ in range(2)]
     monkeypatch.setattr(by_shape, "evaluate_by_shape", lambda *_: twice)
     assert "fit in two ways" in register_by_shape(target, source).reason
     monkeypatch.setattr(by_shape, "evaluate_by_shape", lambda *_: twice[:1])
     assert register_by_shape(target, source).status == "accepted"
-    wide = [SimpleNamespace(proposal=proposal(), evidence=SEEN, covariance=np.eye(7))]
+    wide = [EvaluatedPose(proposal(), SEEN, np.eye(7), flaw="")]
     monkeypatch.setattr(by_shape, "evaluate_by_shape", lambda *_: wide)
     assert "determines the pose only to" in register_by_shape(target, source).reason
     monkeypatch.setattr(by_shape, "evaluate_by_shape", lambda *_: [])

@@ -288,6 +288,11 @@ def test_reviews(store, two_scenes):
     store.registrations.save(none, key("register", "3"))
     with raises(InputError, code="no_pose_of_pair"):
         store.registrations.review(a, b, "confirm")
+    vague = registration(a, b, status="rejected", information=None, reason="colours disagree")
+    store.registrations.save(vague, key("register", "4"))
+    with raises(InputError, code="no_uncertainty_of_pair"):
+        store.registrations.review(a, b, "confirm")
+    assert store.registrations.get(a, b).review is None
 
 
 def measured(a: str, b: str, **more: object) -> Registration:

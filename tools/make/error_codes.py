@@ -201,6 +201,7 @@ ERRORS: Final[Mapping[str, str]] = {
     "no_pose_of_pair": "A pair of scenes has no relative pose.",
     "no_plan": "A component has no content of which a plan could be drawn.",
     "no_poses": "The map has no poses yet.",
+    "no_uncertainty_of_pair": "The uncertainty of a rejected pose is unknown.",
     "not_removed": "The scene was not removed.",
     "nothing_near": "No scene or object lies near the given place.",
     "nothing_to_merge": "There is no scene to merge, or none lies in the tile.",
