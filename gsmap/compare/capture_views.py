@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from gsmap._native import place_points
+from gsmap._native import count_observations, place_points
 from gsmap.compare.neighbourhoods import depth_extremes, erode
 from gsmap.geometry.voxels import voxel_labels
 from gsmap.render import ChunkIndex, render
@@ -49,11 +50,6 @@ class View:
     solid: np.ndarray
     dominant_id: np.ndarray
 
-    def pixels_a_metre(self, z: np.ndarray) -> np.ndarray:
-        """Return the resolution of the view at depths z, in pixels per metre."""
-        out: np.ndarray = (self.camera.intrinsics_px[0, 0] / z).astype(np.float32)
-        return out
-
 
 @dataclass(frozen=True, eq=False)
 class ProjectedPoints:
@@ -81,7 +77,7 @@ class CaptureViews:
             Without views all bits are set.
         sharpness: (N,) float32 sum over these views of (pixels per metre)^2; it is larger for more and nearer views.
         sure: per view, an (H, W) mask of solid pixels whose surface enough views of the capture observed.
-        placed: per view, the projections of the capture's own Gaussians.
+        own_points: see ``placed``; None if they are projected on first use.
     """
 
     scene: PosedScene
@@ -92,11 +88,19 @@ class CaptureViews:
     directions: np.ndarray
     sharpness: np.ndarray
     sure: tuple[np.ndarray, ...]
-    placed: tuple[ProjectedPoints, ...]
+    own_points: tuple[ProjectedPoints, ...] | None = None
 
     @property
     def gaussians(self) -> Gaussians:
         return self.scene.gaussians
+
+    @cached_property
+    def placed(self) -> tuple[ProjectedPoints, ...]:
+        """Per view, the projections of the capture's own Gaussians."""
+        if self.own_points is not None:
+            return self.own_points
+        index = ChunkIndex.build(self.gaussians)
+        return tuple(_project_visible(self.gaussians.means, view, index) for view in self.views)
 
 
 def render_views(
@@ -108,19 +112,27 @@ def render_views(
     views, largest = _render(scene.gaussians, select_cameras(scene, longest_side_px, max_views), index)
     times_seen, sharpness = np.zeros(count, dtype=np.int32), np.zeros(count, dtype=np.float32)
     directions = np.full(count, 0 if views else 2 ** len(DIRECTIONS) - 1, dtype=np.uint32)  # all, if nothing is known
-    placed = tuple(_project_visible(scene.gaussians.means, view, index) for view in views)
-    for view, at in zip(views, placed, strict=True):
-        margin = MIN_TOLERANCE_M
-        on = (at.z > view.near[at.row, at.column] - margin) & (at.z < view.far[at.row, at.column] + margin)
-        rows = at.index[on]
-        times_seen[rows] += 1
-        directions[rows] |= _direction_bits(scene.gaussians.means.take(rows, axis=0), view)
-        sharpness[rows] += view.pixels_a_metre(at.z[on]) ** 2
+    for view in views:
+        count_observations(
+            np.ascontiguousarray(scene.gaussians.means, np.float32),
+            spans=_visible_ranges(view, index),
+            pose=np.ascontiguousarray(view.camera.T_camera_frame[0], np.float64),
+            lens=np.ascontiguousarray(view.camera.intrinsics_px[0], np.float64),
+            near=view.near,
+            far=view.far,
+            nearest=NEAREST_M,
+            margin=MIN_TOLERANCE_M,
+            axes=DIRECTIONS,
+            min_cosine=_MIN_COSINE,
+            times_seen=times_seen,
+            directions=directions,
+            sharpness=sharpness,
+        )
     well = max_per_cell(scene.gaussians.means, times_seen, CELL_M) >= MIN_VIEWS
     well |= not views
     sure = tuple(v.solid & well[v.dominant_id] & (v.dominant_id >= 0) for v in views) if count else ()
     surface = largest >= MIN_WEIGHT if views else np.ones(count, dtype=bool)
-    return CaptureViews(scene, tuple(views), surface, times_seen, well, directions, sharpness, sure, placed)
+    return CaptureViews(scene, tuple(views), surface, times_seen, well, directions, sharpness, sure)
 
 
 def observed_from(points: np.ndarray, directions: np.ndarray, view: View) -> np.ndarray:
@@ -136,13 +148,6 @@ def observed_from(points: np.ndarray, directions: np.ndarray, view: View) -> np.
     nearest = (_rays(points, view) @ DIRECTIONS.T).argmax(1)
     out: np.ndarray = (directions >> nearest.astype(np.uint32)) & 1 > 0
     return out
-
-
-def _direction_bits(points: np.ndarray, view: View) -> np.ndarray:
-    """Return the (N,) uint32 bits of all `DIRECTIONS` near that of the view from points (N, 3)."""
-    near = _rays(points, view) @ DIRECTIONS.T > _MIN_COSINE
-    bits: np.ndarray = np.packbits(np.pad(near, ((0, 0), (0, 32 - len(DIRECTIONS)))), axis=1, bitorder="little")
-    return bits.view("<u4")[:, 0].astype(np.uint32, copy=False)
 
 
 def _rays(points: np.ndarray, view: View) -> np.ndarray:
@@ -188,11 +193,14 @@ def project_points(points: np.ndarray, view: View, nearest_m: float) -> Projecte
     )
 
 
+def _visible_ranges(view: View, index: ChunkIndex) -> np.ndarray:
+    camera = view.camera
+    return index.visible_ranges(camera.T_camera_frame[0], camera.intrinsics_px[0], *camera.sizes_px[0].tolist())
+
+
 def _project_visible(points: np.ndarray, view: View, index: ChunkIndex) -> ProjectedPoints:
     """Return `project_points` of the means of Gaussians, of which only visible chunks are projected."""
-    camera = view.camera
-    lens, (width, height) = camera.intrinsics_px[0], camera.sizes_px[0].tolist()
-    ranges = index.visible_ranges(camera.T_camera_frame[0], lens, width, height)
+    ranges = _visible_ranges(view, index)
     rows = np.concatenate([np.zeros(0, np.int64), *(np.arange(start, stop) for start, stop in ranges)])
     visible = np.concatenate([points[:0], *(points[start:stop] for start, stop in ranges)])
     at = project_points(visible, view, NEAREST_M)

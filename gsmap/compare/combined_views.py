@@ -72,7 +72,7 @@ def mask_outdated(capture: CaptureViews, comparison: Comparison, stays: np.ndarr
         view = picture.own
         colour = comparison.balance.applied(view.colour)
         views.append(replace(view, colour=colour, solid=view.solid & so, opaque=view.opaque & so))
-    return replace(capture, views=tuple(views), sure=tuple(sure))
+    return replace(capture, views=tuple(views), sure=tuple(sure), own_points=capture.placed)
 
 
 def _select_views(captures: Sequence[CaptureViews], of: PosedScene, max_views: int) -> list[list[int]]:

@@ -26,6 +26,9 @@ using Rows = nb::ndarray<const int32_t, nb::shape<-1>, nb::c_contig, nb::device:
 using Depths = nb::ndarray<const float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Counts = nb::ndarray<int32_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Sums = nb::ndarray<float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using Bits = nb::ndarray<uint32_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using Spans = nb::ndarray<const int64_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+using Axes = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using HueSums = nb::ndarray<float, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
 
 constexpr int64_t kBand = 8;  // rows
@@ -94,6 +97,29 @@ template <class P> void check(const Rows &index, const Rows &row, const Rows &co
             std::size_t(row.data()[i]) >= picture.shape(0) || std::size_t(column.data()[i]) >= picture.shape(1))
             throw std::invalid_argument("a point that is none, or outside of the picture");
 }
+
+// Where points fall in the picture of a camera (frame to camera, fx fy cx cy).
+struct Projection {
+    float m[3][4], k[4], width, height, nearest;
+    int row, column;
+    float depth;
+    Projection(const Pose &pose, const Lens &lens, int width, int height, double nearest)
+        : width(float(width)), height(float(height)), nearest(float(nearest)) {
+        for (int i = 0; i < 12; ++i) m[i / 4][i % 4] = float(pose.data()[i]);
+        for (int i = 0; i < 4; ++i) k[i] = float(lens.data()[i]);
+    }
+    // Whether a point falls in it, beyond `nearest`; then row, column and depth are those of the point.
+    bool shows(const float *p) {
+        depth = m[2][0] * p[0] + m[2][1] * p[1] + m[2][2] * p[2] + m[2][3];
+        if (!(depth > nearest)) return false;
+        const float x = k[0] * (m[0][0] * p[0] + m[0][1] * p[1] + m[0][2] * p[2] + m[0][3]) / depth + k[2];
+        if (!(x >= 0 && x < width)) return false;
+        const float y = k[1] * (m[1][0] * p[0] + m[1][1] * p[1] + m[1][2] * p[2] + m[1][3]) / depth + k[3];
+        if (!(y >= 0 && y < height)) return false;
+        row = int(y), column = int(x);
+        return true;
+    }
+};
 
 void add_colour(std::size_t pixel, int32_t point, const Hues &chroma, const Plane &lightness, const Counts &seen,
                 const HueSums &chroma_sum, const Sums &lightness_sum) {
@@ -220,18 +246,12 @@ void bind_pictures(nb::module_ &m) {
             std::vector<float> z;
             {
                 nb::gil_scoped_release release;
-                float m[3][4], k[4];
-                for (int i = 0; i < 12; ++i) m[i / 4][i % 4] = float(pose.data()[i]);
-                for (int i = 0; i < 4; ++i) k[i] = float(lens.data()[i]);
-                for (std::size_t i = 0; i < points.shape(0); ++i) {
-                    const float *p = points.data() + 3 * i;
-                    const float depth = m[2][0] * p[0] + m[2][1] * p[1] + m[2][2] * p[2] + m[2][3];
-                    if (!(depth > float(nearest))) continue;
-                    const float x = k[0] * (m[0][0] * p[0] + m[0][1] * p[1] + m[0][2] * p[2] + m[0][3]) / depth + k[2];
-                    const float y = k[1] * (m[1][0] * p[0] + m[1][1] * p[1] + m[1][2] * p[2] + m[1][3]) / depth + k[3];
-                    if (!(x >= 0 && x < float(width) && y >= 0 && y < float(height))) continue;
-                    index.push_back(int32_t(i)), row.push_back(int32_t(y)), column.push_back(int32_t(x)), z.push_back(depth);
-                }
+                Projection to(pose, lens, width, height, nearest);
+                for (std::size_t i = 0; i < points.shape(0); ++i)
+                    if (to.shows(points.data() + 3 * i)) {
+                        index.push_back(int32_t(i)), row.push_back(to.row), column.push_back(to.column);
+                        z.push_back(to.depth);
+                    }
             }
             const std::size_t count = index.size();
             return std::make_tuple(numpy_of(std::move(index), {count}), numpy_of(std::move(row), {count}),
@@ -240,6 +260,49 @@ void bind_pictures(nb::module_ &m) {
         nb::arg("points"), nb::arg("pose"), nb::arg("lens"), nb::arg("width"), nb::arg("height"), nb::arg("nearest"),
         "Which points (n,) fall in the picture of a camera (frame to camera (4, 4), fx fy cx cy) beyond `nearest`; their row\n"
         "(n,) and column (n,) there, and their depth (n,).");
+    m.def(
+        "count_observations",
+        [](Floats points, Spans spans, Pose pose, Lens lens, Plane near, Plane far, double nearest, double margin, Axes axes,
+           double min_cosine, Counts times_seen, Bits directions, Sums sharpness) {
+            const std::size_t n = points.shape(0);
+            same_size(near, far);
+            if (times_seen.shape(0) != n || directions.shape(0) != n || sharpness.shape(0) != n || axes.shape(0) > 32)
+                throw std::invalid_argument("counts of other points, or more than 32 directions");
+            for (std::size_t i = 0; i < spans.shape(0); ++i)
+                if (spans.data()[2 * i] < 0 || spans.data()[2 * i + 1] > int64_t(n)) throw std::invalid_argument("no such points");
+            nb::gil_scoped_release release;
+            Projection to(pose, lens, int(near.shape(1)), int(near.shape(0)), nearest);
+            double centre[3] = {};
+            for (int c = 0; c < 3; ++c)
+                for (int r = 0; r < 3; ++r) centre[c] -= pose.data()[4 * r + c] * pose.data()[4 * r + 3];
+            for (std::size_t span = 0; span < spans.shape(0); ++span)
+                for (int64_t i = spans.data()[2 * span]; i < spans.data()[2 * span + 1]; ++i) {
+                    const float *p = points.data() + 3 * i;
+                    if (!to.shows(p)) continue;
+                    const std::size_t pixel = std::size_t(to.row) * near.shape(1) + std::size_t(to.column);
+                    if (!(to.depth > near.data()[pixel] - float(margin) && to.depth < far.data()[pixel] + float(margin))) continue;
+                    ++times_seen.data()[i];
+                    const float fine = float(lens.data()[0] / double(to.depth));
+                    sharpness.data()[i] += fine * fine;
+                    double ray[3], squared = 0;
+                    for (int c = 0; c < 3; ++c) ray[c] = centre[c] - double(p[c]), squared += ray[c] * ray[c];
+                    const double length = std::max(std::sqrt(squared), 1e-9);
+                    for (double &c : ray) c /= length;
+                    uint32_t near_axes = 0;
+                    for (std::size_t d = 0; d < axes.shape(0); ++d) {
+                        const double *axis = axes.data() + 3 * d;
+                        const bool is_near = ray[0] * axis[0] + ray[1] * axis[1] + ray[2] * axis[2] > min_cosine;
+                        near_axes |= uint32_t(is_near) << d;
+                    }
+                    directions.data()[i] |= near_axes;
+                }
+        },
+        nb::arg("points"), nb::arg("spans"), nb::arg("pose"), nb::arg("lens"), nb::arg("near"), nb::arg("far"),
+        nb::arg("nearest"), nb::arg("margin"), nb::arg("axes"), nb::arg("min_cosine"), nb::arg("times_seen"),
+        nb::arg("directions"), nb::arg("sharpness"),
+        "Adds to the counts (N,) of points, of which those in spans (S, 2) of rows are looked at, that one view observes them:\n"
+        "they lie within a margin of the depths near and far (H, W) of its surface. `directions` has a bit for each axis (D, 3)\n"
+        "that the ray to the camera is near to, `sharpness` the square of pixels a metre.");
     m.def(
         "count_looks",
         [](Rows index, Rows row, Rows column, Depths z, Plane near, Plane far, Plane depth, Mask solid, Mask opaque, Mask sure,

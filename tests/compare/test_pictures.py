@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from gsmap._native import add_colours, beyond_ranges, depth_ranges, place_points, tones_apart
+from gsmap._native import add_colours, beyond_ranges, count_observations, depth_ranges, place_points, tones_apart
 from gsmap.geometry.projection import in_image, project
+from gsmap.geometry.rotations import exp_so3
 
 SIZES = [(1, 1), (1, 5), (7, 1), (8, 9), (37, 20)]
 
@@ -60,6 +61,36 @@ def test_points_are_placed_where_they_are_projected():
     np.testing.assert_array_equal(np.stack([column, row], axis=1), pixels[expected].astype(int))
     np.testing.assert_allclose(z, depth[expected], rtol=1e-6)
     assert len(expected) > 20
+
+
+def test_observations_of_points_on_a_surface_are_counted():
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-2, 2, (500, 3)).astype(np.float32)
+    pose, lens = np.eye(4), np.array([50.0, 55.0, 30.0, 20.0])
+    pose[:3, :3], pose[:3, 3] = exp_so3(np.array([[0.1, -0.2, 0.3]]))[0], (0.1, -0.2, 0.5)
+    near = rng.uniform(0.5, 2, (40, 60)).astype(np.float32)
+    far = near + rng.uniform(0, 2, near.shape).astype(np.float32)
+    spans, axes = np.array([[10, 200], [300, 450]]), np.concatenate([np.eye(3), -np.eye(3)])
+    seen, bits, sharpness = np.ones(500, np.int32), np.full(500, 1 << 9, np.uint32), np.zeros(500, np.float32)
+    options = {"nearest": 0.2, "margin": 0.03, "axes": axes, "min_cosine": 0.5}
+    counts = {"times_seen": seen, "directions": bits, "sharpness": sharpness}
+    count_observations(points, spans, pose, lens, near, far, **options, **counts)
+
+    pixels, depth = project(points, pose, lens)
+    asked = np.zeros(500, bool)
+    asked[10:200] = asked[300:450] = True
+    rows = np.flatnonzero(asked & in_image(pixels, depth, np.array([60, 40]), near=0.2))
+    column, row = pixels[rows].astype(int).T
+    on = rows[(depth[rows] > near[row, column] - 0.03) & (depth[rows] < far[row, column] + 0.03)]
+    assert 10 < len(on) < len(rows)
+    expected = np.ones(500, int)
+    expected[on] += 1
+    np.testing.assert_array_equal(seen, expected)
+    np.testing.assert_allclose(sharpness[on], (50 / depth[on]) ** 2, rtol=1e-5)
+    rays = np.linalg.inv(pose)[:3, 3] - points
+    is_near = rays @ axes.T > 0.5 * np.linalg.norm(rays, axis=1, keepdims=True)
+    is_near[expected == 1] = False
+    np.testing.assert_array_equal(bits, (1 << 9) + is_near @ (1 << np.arange(6)))
 
 
 def test_a_point_outside_of_the_picture_is_refused():
