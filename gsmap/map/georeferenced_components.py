@@ -56,7 +56,7 @@ def georeferenced_components(graph: PoseGraph | None, components: Collection[int
     found = {}
     for tie in graph.world if graph is not None else ():
         if tie.component in components and tie.S_world_map is not None and tie.frame is not None:
-            from gsmap.world.frame import T_ecef_frame
+            from gsmap.geodesy.frame import T_ecef_frame
 
             S_ecef_map: Sim3 | ConfigError
             try:

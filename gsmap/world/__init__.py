@@ -1,8 +1,6 @@
-"""Georeferencing: coordinate reference systems, the world frame, and positions of photos; pure functions.
+"""Georeferencing: settings, and positions of photos; `gsmap.geodesy` converts coordinates.
 
-`crs` and `frame` use PROJ to convert coordinates of any CRS exactly to metres in a Euclidean frame and back. `survey`
-converts all observations of a map; `exif` reads the positions of photos. The pose graph (`gsmap.optimize`) solves for
-the map's pose in the world. pyproj is imported on first use.
+The pose graph (`gsmap.optimize`) solves for the map's pose in the world.
 """
 
 from __future__ import annotations

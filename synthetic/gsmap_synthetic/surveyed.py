@@ -190,7 +190,7 @@ def _marks(
     rng: np.random.Generator,
     frame: WorldFrame,
 ) -> list[Mark]:
-    from gsmap.world.frame import from_frame
+    from gsmap.geodesy.frame import from_frame
 
     controls = _spread(p)[: p.num_control]
     checks = rng.choice([k for k in range(len(names)) if k not in controls], p.num_check, replace=False).tolist()

@@ -24,7 +24,7 @@ LAYERS = [
     {"reason_codes", "errors", "texts"},
     {"durable", "markup"},
     {"types"},
-    {"geometry"},
+    {"geometry", "geodesy"},
     {"methods"},
     {"settings", "stream"},
     {"formats", "render", "networks"},
@@ -76,7 +76,7 @@ HOMES = {
     "pandas": {"types"},
     "pxr": {"formats"},
     "tomlkit": {"settings"},
-    "pyproj": {"world"},
+    "pyproj": {"geodesy"},
     "typer": {"cli"},
     "rich": {"cli"},
 }

@@ -10,11 +10,11 @@ from PIL import Image
 
 from gsmap.evaluate.renders import compare_renders, find_images
 from gsmap.formats import gcp_list
+from gsmap.geodesy.frame import from_frame
 from gsmap.geometry.camera_models import camera_model, photo_pixels, pinhole_views, rays_of
 from gsmap.geometry.sh import SH_C0
 from gsmap.map.world.georeference import Request
 from gsmap.types import Cameras, Gaussians
-from gsmap.world.frame import from_frame
 from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "world"))

@@ -13,12 +13,12 @@ from PIL import Image
 import gsmap
 from gsmap.errors import InputError, NotFoundError
 from gsmap.formats import gcp_list
+from gsmap.geodesy.frame import from_frame
 from gsmap.map import Map
 from gsmap.map.world.georeference import Request
 from gsmap.map.world.photo_names import match_photos, rows_of_photo
 from gsmap.optimize.survey_system import System
 from gsmap.types import Cameras
-from gsmap.world.frame import from_frame
 from gsmap_synthetic.surveyed import Site, SiteParams, ground, surveyed_site
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "world"))

@@ -13,8 +13,8 @@ from pyproj import Transformer
 
 import gsmap
 from gsmap.errors import ConfigError, NotFoundError
+from gsmap.geodesy.frame import from_frame, to_frame
 from gsmap.map.world.georeference import Request
-from gsmap.world.frame import from_frame, to_frame
 from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "world"))

@@ -47,7 +47,7 @@ def world_of(path: Path) -> dict[str, np.ndarray]:
 
 def test_world_coordinates_are_right_and_last(tied: Path, site: Site, tmp_path: Path) -> None:
     """Eight digits before the point, to a centimetre by the survey and to a thousandth through store and export."""
-    from gsmap.world.frame import from_frame
+    from gsmap.geodesy.frame import from_frame
 
     found = world_of(tied)
     truth = dict(zip(site.names, from_frame(site.frame, np.array([S.translation for S in site.truth])), strict=True))
@@ -59,7 +59,7 @@ def test_world_coordinates_are_right_and_last(tied: Path, site: Site, tmp_path: 
         here = m.pose_rows("EPSG:4326")
     assert max(np.abs(np.array(row["world"]) - found[row["scene_name"]]).max() for row in rows) < 1e-9
     back = np.array([row.world for row in here])
-    from gsmap.world.frame import to_frame
+    from gsmap.geodesy.frame import to_frame
 
     again = from_frame(site.frame, to_frame(site.frame, back, "EPSG:4326"))
     assert np.abs(again - np.array([found[row.scene_name] for row in here])).max() < 1e-3
@@ -79,7 +79,7 @@ def test_a_surveyed_map_is_reported(tied: Path, tmp_path: Path) -> None:
 
 
 def test_measuring(tied: Path, site: Site) -> None:
-    from gsmap.world.frame import from_frame
+    from gsmap.geodesy.frame import from_frame
 
     true = float(np.linalg.norm(site.truth[0].translation - site.truth[8].translation))
     with gsmap.map.open(tied) as m:
@@ -277,8 +277,8 @@ def test_heights_of_a_state_plane_are_in_feet(tmp_path: Path, capsys: pytest.Cap
 
     from gsmap.cli import app
     from gsmap.formats import gcp_list
+    from gsmap.geodesy.frame import from_frame
     from gsmap.types.world import WorldFrame
-    from gsmap.world.frame import from_frame
 
     foot = 1200 / 3937
     boston = surveyed_site(3, replace(SITE, rows=2, num_control=4), WorldFrame("EPSG:6319", 42.36, -71.06, 30.0))
@@ -309,7 +309,7 @@ def test_heights_of_a_state_plane_are_in_feet(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_surveyed_positions_of_scenes(site: Site, tmp_path: Path) -> None:
-    from gsmap.world.frame import from_frame
+    from gsmap.geodesy.frame import from_frame
 
     with made_map(tmp_path / "m.gsmap", site) as m:
         for k in (0, 2, 6, 8):
@@ -327,8 +327,8 @@ def test_surveyed_positions_of_scenes(site: Site, tmp_path: Path) -> None:
 def test_what_is_exported_says_where_it_lies(tied: Path, site: Site, tmp_path: Path) -> None:
     """3D Tiles lie on the globe; other formats, whose numbers are too short for it, have it beside them."""
     from gsmap.formats import tiles3d
-    from gsmap.world.crs import ECEF
-    from gsmap.world.frame import from_frame
+    from gsmap.geodesy.crs import ECEF
+    from gsmap.geodesy.frame import from_frame
 
     with gsmap.map.open(tied) as m:
         m.export(tmp_path / "globe", tile_size_m=20, format="3dtiles", merge="union")
@@ -350,12 +350,12 @@ def test_what_is_exported_says_where_it_lies(tied: Path, site: Site, tmp_path: P
 
 def test_a_map_in_a_system_without_a_way_to_the_globe_is_exported(tied: Path, tmp_path: Path, monkeypatch) -> None:
     """CGCS2000 has no transformation to WGS 84 in PROJ: only 3D Tiles need one."""
-    import gsmap.world.frame
+    import gsmap.geodesy.frame
 
     def nowhere(frame: object) -> None:
         raise ConfigError("PROJ knows no exact transformation", code="no_exact_transform")
 
-    monkeypatch.setattr(gsmap.world.frame, "T_ecef_frame", nowhere)
+    monkeypatch.setattr(gsmap.geodesy.frame, "T_ecef_frame", nowhere)
     with gsmap.map.open(tied) as m:
         m.export(tmp_path / "plain", tile_size_m=0, format="ply", merge="union")
         m.export(tmp_path / "stream", tile_size_m=20, format="streamed-sog", merge="union")
@@ -438,7 +438,7 @@ def test_positions_in_exif_tie_a_map(tmp_path: Path) -> None:
     """A drone's photos: heights above sea level, and what a whole flight is off by, are in the sigma."""
     from PIL import Image
 
-    from gsmap.world.frame import from_frame
+    from gsmap.geodesy.frame import from_frame
 
     site = surveyed_site(4, replace(SITE, spacing_m=40.0, edge_translation_m=5e-3))
     rng, folder = np.random.default_rng(0), tmp_path / "photos"
@@ -498,7 +498,7 @@ def test_photos_above_take_off_are_named_and_tie_nothing_anew(tied: Path, site: 
         m.clone(tmp_path / "c.gsmap")
     with gsmap.map.open(tmp_path / "c.gsmap") as m:
         ids = {scene.name: scene.id for scene in m.store.scenes.list()}
-        from gsmap.world.frame import from_frame
+        from gsmap.geodesy.frame import from_frame
 
         fixes = []
         for name, S, cameras in zip(site.names, site.truth, site.cameras, strict=True):

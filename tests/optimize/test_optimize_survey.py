@@ -117,7 +117,7 @@ def test_points_that_are_less_precise_than_stated_are_seldom_taken_for_blunders(
 
 
 def _in_enu(site: Site, off: tuple[float, float, float]) -> np.ndarray:
-    from gsmap.world.frame import to_frame
+    from gsmap.geodesy.frame import to_frame
 
     mark = next(mark for mark in site.marks if mark.name == "G2")
     a, b = to_frame(site.frame, np.stack([mark.surveyed, mark.surveyed + off]))

@@ -8,9 +8,9 @@ import numpy as np
 
 import gsmap
 from gsmap.formats import gcp_list
+from gsmap.geodesy.survey import in_frame
 from gsmap.map import Map
 from gsmap.types.world import ControlPoint, ImagePoint, Survey
-from gsmap.world.survey import in_frame
 from gsmap_synthetic.surveyed import Site, ground
 
 

@@ -21,6 +21,9 @@ from scipy.stats import chi2
 
 import gsmap
 from gsmap.formats import gcp_list, tiles3d
+from gsmap.geodesy.crs import ECEF
+from gsmap.geodesy.frame import from_frame, to_frame
+from gsmap.geodesy.survey import in_frame
 from gsmap.geometry.similarities import Similarities
 from gsmap.geometry.umeyama import umeyama
 from gsmap.map import Map
@@ -28,9 +31,6 @@ from gsmap.map.world.georeference import Request
 from gsmap.optimize import joint_covariance, optimize
 from gsmap.types import PoseGraph
 from gsmap.types.world import ControlPoint, Georeference, ImagePoint, Survey
-from gsmap.world.crs import ECEF
-from gsmap.world.frame import from_frame, to_frame
-from gsmap.world.survey import in_frame
 from gsmap_synthetic.surveyed import Site, SiteParams, ground, surveyed_site
 from tools.harness import argument_parser, timed
 

@@ -31,7 +31,7 @@ def world_report(store: Store, *, stale: bool, notes: Sequence[str] = ()) -> Wor
     frame = survey.frame
     system = None
     if frame is not None:
-        from gsmap.world.crs import crs
+        from gsmap.geodesy.crs import crs
 
         system = crs(frame.crs)
     return WorldReport(
@@ -125,8 +125,8 @@ def world_positions(
     ties = {tie.component: tie for tie in store.revisions.world() if tie.S_world_map is not None and tie.frame}
     if not ties:
         return None, {}
-    from gsmap.world.crs import crs
-    from gsmap.world.frame import from_frame
+    from gsmap.geodesy.crs import crs
+    from gsmap.geodesy.frame import from_frame
 
     found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     named = None

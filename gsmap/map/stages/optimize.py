@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from gsmap import optimize as solver
+from gsmap.geodesy.survey import in_frame
 from gsmap.map.date_filter import parse_moment
 from gsmap.map.reports.common import up_directions
 from gsmap.map.settings import Settings
@@ -26,7 +27,6 @@ from gsmap.types import Edge, PoseGraph, Prior
 from gsmap.types.plain import canonical, of_plain
 from gsmap.types.progress import StageProgress
 from gsmap.types.world import Survey
-from gsmap.world.survey import in_frame
 
 
 @dataclass(frozen=True, eq=False)

@@ -94,7 +94,7 @@ def measure(
     sigma = float(np.sqrt(max(0.0, variance)))
     heights = None
     if named is not None:
-        from gsmap.world.crs import crs as crs_of
+        from gsmap.geodesy.crs import crs as crs_of
 
         heights = crs_of(named).heights
     return MeasureReport(
@@ -120,7 +120,7 @@ def _where(store: Store, one: SpecifiedPoint, graph: PoseGraph, component: int |
             raise NotFoundError(
                 "the map is not tied to the world: gsmap georeference does so", code="not_georeferenced"
             )
-        from gsmap.world.frame import to_frame
+        from gsmap.geodesy.frame import to_frame
 
         frame = tied[0].frame
         assert frame is not None
@@ -252,7 +252,7 @@ def _turn(graph: PoseGraph, end: _LocatedPoint) -> np.ndarray:
 
 
 def _row(solved: _PoseUncertainty, end: _LocatedPoint, frame: WorldFrame | None, crs: str | None) -> PointRow:
-    from gsmap.world.frame import from_frame
+    from gsmap.geodesy.frame import from_frame
 
     scene = end.place.scene
     covariance = None if end.metric is None else _world_covariance(solved, end)

@@ -11,6 +11,9 @@ import numpy as np
 
 from gsmap.errors import ConfigError, GsmapError, InputError, NotFoundError
 from gsmap.formats import gcp_list
+from gsmap.geodesy.crs import WGS84, crs
+from gsmap.geodesy.frame import frame_at, from_frame, to_frame
+from gsmap.geodesy.survey import check_area, frame_for, in_frame
 from gsmap.ingest.dates import photo_date
 from gsmap.map.date_filter import parse_moment
 from gsmap.map.localization.photo_poses import LocalizePhotos
@@ -23,11 +26,8 @@ from gsmap.store import Store
 from gsmap.store.world import Observation
 from gsmap.types import Cameras
 from gsmap.types.world import UNSOLVED, ControlPoint, ImagePoint, PositionFix, ScaleBar, Survey, WorldFrame
-from gsmap.world.crs import WGS84, crs
 from gsmap.world.exif import read_folder
-from gsmap.world.frame import frame_at, from_frame, to_frame
 from gsmap.world.params import BAR_SIGMA_FRACTION, DEPTH_SIGMA_FRACTION, PIXEL_SIGMA_PX
-from gsmap.world.survey import check_area, frame_for, in_frame
 
 SURVEYED = "survey"
 """The name of a position fix that gives the position of a scene's origin."""

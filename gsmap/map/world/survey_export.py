@@ -23,6 +23,8 @@ from gsmap.export.survey_files import (
     write_geotiff,
     write_points,
 )
+from gsmap.geodesy.crs import WGS84, crs
+from gsmap.geodesy.frame import from_frame
 from gsmap.geometry.boxes import robust_box
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.map.georeferenced_components import GeoreferencedComponent, world_notes
@@ -36,8 +38,6 @@ from gsmap.store import Store
 from gsmap.types import Gaussians, Sim3
 from gsmap.types.progress import Progress
 from gsmap.types.world import WorldFrame
-from gsmap.world.crs import WGS84, crs
-from gsmap.world.frame import from_frame
 
 KINDS = {
     **dict.fromkeys((".las", ".laz"), "points"),

@@ -9,9 +9,9 @@ from typing import TypeVar
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.geodesy.crs import crs
+from gsmap.geodesy.frame import frame_at, to_frame
 from gsmap.types.world import LOCAL, ControlPoint, PositionFix, Survey, WorldFrame
-from gsmap.world.crs import crs
-from gsmap.world.frame import frame_at, to_frame
 
 _T = TypeVar("_T", ControlPoint, PositionFix)
 

@@ -7,9 +7,9 @@ import pytest
 from raising import raises
 
 from gsmap.errors import ConfigError, InputError
+from gsmap.geodesy.crs import ECEF, WGS84, crs, transform_datum
+from gsmap.geodesy.frame import T_ecef_frame, frame_at, from_frame, to_frame
 from gsmap.types.world import WorldFrame
-from gsmap.world.crs import ECEF, WGS84, crs, transform_datum
-from gsmap.world.frame import T_ecef_frame, frame_at, from_frame, to_frame
 
 UTM = np.array([[691234.1234, 5334567.7654, 519.321], [690234.1, 5334067.7, 529.321], [701234.1, 5344567.0, 719.3]])
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmap.geodesy.crs import ECEF, crs, transform_datum
 from gsmap.types import Sim3
 from gsmap.types.world import WorldFrame
-from gsmap.world.crs import ECEF, crs, transform_datum
 
 
 def frame_at(crs_text: str, points: np.ndarray) -> WorldFrame:
