@@ -91,18 +91,17 @@ def command(
 
 def _report(m: Map, thing: str) -> SceneReport | PairReport | ChangeDetail | HistoryReport:
     from gsmap.errors import NotFoundError
-    from gsmap.map.changes.rows import change_number
-    from gsmap.store.objects import number_of
+    from gsmap.store import changes, objects
 
     # A scene name may contain a colon, or look like a change; the id of a scene may begin like a change.
-    if change_number(thing) is not None and all(scene.name != thing for scene in m.scenes()):
+    if changes.number_of(thing) is not None and all(scene.name != thing for scene in m.scenes()):
         return m.show_change(thing)
     try:
         return m.show_scene(thing)
     except NotFoundError:
         if ":" in thing:
             return m.show_pair(thing)
-        if number_of(thing) is not None:
+        if objects.number_of(thing) is not None:
             return m.history(thing)
         raise
 

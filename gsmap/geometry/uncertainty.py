@@ -35,3 +35,10 @@ def point_jacobian(point: np.ndarray) -> np.ndarray:
 def largest_sigma(covariance: np.ndarray) -> float:
     """Return the standard deviation in the least certain direction of a covariance (N, N)."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1].clip(0)))
+
+
+def max_sigmas(covariance: np.ndarray | None) -> tuple[float, float]:
+    """Return the largest standard deviations of rotation (rad) and of translation; inf if the covariance is None."""
+    if covariance is None:
+        return np.inf, np.inf
+    return largest_sigma(covariance[:3, :3]), largest_sigma(covariance[3:6, 3:6])

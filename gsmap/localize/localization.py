@@ -10,7 +10,7 @@ from PIL import Image
 
 from gsmap.geometry.filters import blur
 from gsmap.geometry.projection import in_image, project
-from gsmap.geometry.uncertainty import largest_sigma
+from gsmap.geometry.uncertainty import max_sigmas
 from gsmap.localize import covariance, evidence, feature_frames, matching, mismatch, probability, resection, verdict
 from gsmap.localize.candidate_renders import GREY, sample_mask
 from gsmap.localize.candidates import PoseCandidate, is_duplicate, match_views, propose_poses
@@ -274,13 +274,6 @@ def evaluate_pose(
     coarse = evidence.compare_coarsely(photo.rgb, refined.renders, mismatches, photo.mask)
     pieces |= probability.render_evidence(comparison, coarse, mismatches)
     return EvaluatedPose(candidate, refined, known, pieces, model.probability(pieces, aliased_prior))
-
-
-def max_sigmas(covariance: np.ndarray | None) -> tuple[float, float]:
-    """Return the largest standard deviations of rotation (rad) and of translation; inf if the covariance is None."""
-    if covariance is None:
-        return np.inf, np.inf
-    return largest_sigma(covariance[:3, :3]), largest_sigma(covariance[3:6, 3:6])
 
 
 def rival_probability(poses: Sequence[EvaluatedPose]) -> float:

@@ -1,4 +1,4 @@
-"""Georeference the components of a revision for exports."""
+"""Georeference the components and the scenes of a revision."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from gsmap.errors import ConfigError
-from gsmap.types import PoseGraph, Sim3
+from gsmap.store import Store
+from gsmap.types import PoseGraph, ScenePose, Sim3
 from gsmap.types.plain import plain
 from gsmap.types.world import WorldFrame
 
@@ -86,3 +89,31 @@ def world_notes(found: Mapping[int, GeoreferencedComponent], format: str, up: st
         f"tiles of {format} are in the map's frame{turned}, since the format has no room for coordinates in {named}: "
         "tiles.json has S_world_map and S_ecef_map beside them; 3dtiles carries its place itself",
     )
+
+
+def world_positions(
+    store: Store, poses: Mapping[str, ScenePose], crs_text: str | None = None
+) -> tuple[tuple[str, str] | None, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Return the CRS with its height reference, and each scene's origin: metres in the world frame, and in the CRS.
+
+    Args:
+        crs_text: another CRS than the map's.
+    """
+    ties = {tie.component: tie for tie in store.revisions.world() if tie.S_world_map is not None and tie.frame}
+    if not ties:
+        return None, {}
+    from gsmap.geodesy.crs import crs
+    from gsmap.geodesy.frame import from_frame
+
+    found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    named = None
+    for component, tie in ties.items():
+        assert tie.frame is not None
+        assert tie.S_world_map is not None
+        mine = [pose for pose in poses.values() if pose.component == component]
+        named = crs_text or tie.frame.crs
+        if mine:
+            metric = tie.S_world_map.apply(np.array([pose.S_map_scene.translation for pose in mine]))
+            world = from_frame(tie.frame, metric, named)
+            found |= {pose.scene: (metric[k], world[k]) for k, pose in enumerate(mine)}
+    return (None if named is None else (named, crs(named).heights)), found

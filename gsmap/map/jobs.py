@@ -1,47 +1,40 @@
-"""Jobs that worker processes run: describe a scene, register or compare a pair, make a tile."""
+"""Jobs that worker processes run: describe a scene, register a pair, make a tile."""
 
 from __future__ import annotations
 
 import os
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
 from gsmap.errors import CorruptError, InputError, StoreError
 from gsmap.geometry.metric_scale import in_metres, scale_gaussians
-from gsmap.geometry.transforms import transform_cameras, transform_gaussians
-from gsmap.methods import RecipeKey, family
+from gsmap.geometry.uncertainty import max_sigmas
+from gsmap.methods import RecipeKey
 from gsmap.store import Store, branches, remote_map, sqlite
 from gsmap.store.array_groups import ArrayResults, StagedResult
 from gsmap.store.photos import StoredPhoto
 from gsmap.types import (
     Cameras,
-    ChangeReport,
     Gaussians,
     MergeResult,
-    PosedScene,
     ReferencePhoto,
     Registration,
     SceneGraph,
-    Sim3,
 )
-from gsmap.types.localization import SceneFeatures
 from gsmap.types.model import ModelSpec
 from gsmap.types.prepared_scene import PreparedScene
 from gsmap.types.progress import Progress
 
 # A job imports its room when it runs, since listing missing results does not need it.
 if TYPE_CHECKING:
-    from gsmap import change as changing
     from gsmap import describe as describing
-    from gsmap import localize as localizing
     from gsmap import register as registering
     from gsmap.export import PlannedTile
-    from gsmap.map.objects.static_filter import DynamicContent
     from gsmap.merge.reference_view_cache import ReferenceViewCache
     from gsmap.register import SceneView
     from gsmap.types.merging import UnchangedPlace
@@ -51,7 +44,7 @@ Result = TypeVar("Result")
 _MAX_PIXELS = 1 << 24  # of a kept photo: so few bytes can claim any number
 
 
-def _store(path: str) -> Store:
+def store_of(path: str) -> Store:
     """Open the map at a path and keep it open for later jobs."""
     return _opened(*_catalog_file(path))
 
@@ -81,7 +74,7 @@ def _view(path: str, scene_id: str, graph_key: str) -> SceneView:
     saves most reads."""
     key = (str(_catalog_file(path)), scene_id, graph_key)
     found = _views.pop(key, None)
-    _views[key] = load_view(_store(path), scene_id, graph_key) if found is None else found
+    _views[key] = load_view(store_of(path), scene_id, graph_key) if found is None else found
     while len(_views) > 2 and sum(view.num_bytes for view in _views.values()) > _VIEW_BYTES:
         _views.popitem(last=False)
     return _views[key]
@@ -131,7 +124,7 @@ def describe_scene(
     from gsmap.register.prepare import prepare
     from gsmap.register.recipe import prepared_key
 
-    store = _store(path)
+    store = store_of(path)
     scenes = store.scenes
     policy = scenes.get(scene_id).scale_policy
     gaussians, cameras = scenes.unread(scene_id).degree_0(), scenes.cameras(scene_id)
@@ -151,38 +144,12 @@ def prepare_scene(path: str, scene_id: str, key: RecipeKey, inbox: str) -> Prepa
     """
     from gsmap.register.prepare import prepare, working_m_of
 
-    store = _store(path)
+    store = store_of(path)
     graph, scenes = store.graphs.load(scene_id, key.inputs[1]), store.scenes
     assert graph is not None, f"scene {scene_id} was to be prepared before it was described"
     gaussians, cameras = scenes.unread(scene_id).degree_0(), scenes.cameras(scene_id)
     found = prepare(scene_id, gaussians, cameras, working_m_of(graph, scenes.get(scene_id).scale_policy))
     return staged(store.prepared_scenes, found, key, inbox)
-
-
-def features_of_scene(
-    path: str,
-    scene_id: str,
-    models: Mapping[str, ModelSpec],
-    params: localizing.Params,
-    key: RecipeKey,
-    inbox: str | None,
-) -> SceneFeatures | StagedResult:
-    """Extract the features of the views of one scene of the map at ``path``.
-
-    Args:
-        key: recipe of the features.
-        inbox: see `staged`; None for features that are not stored.
-    """
-    from gsmap import localize as localizing
-
-    store = _store(path)
-    scenes = store.scenes
-    extractor = family("extractor").get(params.extractor).make(models, params.extractors[params.extractor])
-    gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
-    found = localizing.scene_features(scene_id, gaussians, cameras, extractor, params.views)
-    if inbox is None:
-        return found
-    return staged(store.view_features, found, key, inbox)
 
 
 def register_scenes(
@@ -194,55 +161,39 @@ def register_scenes(
     return registering.register_pair(_view(path, *target), _view(path, *source), params)
 
 
-def compare_scenes(
-    path: str, older: tuple[str, Sim3, str], newer: tuple[str, Sim3, str], params: changing.Params
-) -> tuple[ChangeReport, tuple[int, int]]:
-    """Compare two scenes of the map at ``path``; return the changes and the number of Gaussians of each.
+class OmittedContent(Hashable, Protocol):
+    """Content of one scene that an export leaves out; picklable."""
 
-    Args:
-        older, newer: scene id, S_map_scene and date.
-    """
-    from gsmap import change as changing
+    @property
+    def digest(self) -> str:
+        """Digest of the content; empty without content."""
 
-    before, after = _placed(path, *older), _placed(path, *newer)
-    return changing.compare(before, after, params), (len(before.gaussians), len(after.gaussians))
+    def rows(self, store: Store, scene: str) -> np.ndarray:
+        """Return a mask (N,) that is True for the Gaussians of the scene to leave out."""
 
 
-def _placed(path: str, scene_id: str, S_map_scene: Sim3, captured_at: str) -> PosedScene:
-    """Return a scene in the map frame with its view-independent colour, which is all that comparisons use."""
-    scenes = _store(path).scenes
-    gaussians, cameras = scenes.unread(scene_id).degree_0(), scenes.cameras(scene_id)
-    return PosedScene(
-        transform_gaussians(gaussians, S_map_scene), transform_cameras(cameras, S_map_scene), scene_id, captured_at
-    )
+def _read(path: str, scene_id: str, passing: OmittedContent | None, bounds: np.ndarray | None) -> Gaussians:
+    """Read the Gaussians of a scene that reach into a box in the scene frame, without omitted content."""
+    return store_of(path).scenes.gaussians(scene_id, bounds, _left_out(path, scene_id, passing))
 
 
-def _read(path: str, scene_id: str, passing: DynamicContent | None, bounds: np.ndarray | None) -> Gaussians:
-    """Read the Gaussians of a scene that reach into a box in the scene frame, without dynamic content."""
-    return _store(path).scenes.gaussians(scene_id, bounds, _left_out(path, scene_id, passing))
+def _read_within(path: str, scene_id: str, passing: OmittedContent | None, bounds: np.ndarray) -> Gaussians:
+    """Read the Gaussians of a scene whose means lie in a box, without omitted content."""
+    return store_of(path).scenes.gaussians_within(scene_id, bounds, _left_out(path, scene_id, passing))
 
 
-def _read_within(path: str, scene_id: str, passing: DynamicContent | None, bounds: np.ndarray) -> Gaussians:
-    """Read the Gaussians of a scene whose means lie in a box, without dynamic content."""
-    return _store(path).scenes.gaussians_within(scene_id, bounds, _left_out(path, scene_id, passing))
-
-
-def _left_out(path: str, scene_id: str, passing: DynamicContent | None) -> np.ndarray | None:
+def _left_out(path: str, scene_id: str, passing: OmittedContent | None) -> np.ndarray | None:
     return None if passing is None or not passing.digest else _without(path, scene_id, passing)
 
 
 @lru_cache(maxsize=8)
-def _without(path: str, scene_id: str, passing: DynamicContent) -> np.ndarray:
-    """Return the rows of dynamic content; the answer is cached, as neighbouring tiles need the same scenes."""
-    from gsmap.map.objects import static_filter
-
-    return static_filter.dynamic_rows(_store(path), scene_id, passing)
+def _without(path: str, scene_id: str, passing: OmittedContent) -> np.ndarray:
+    """Return the rows to leave out; the answer is cached, as neighbouring tiles need the same scenes."""
+    return passing.rows(store_of(path), scene_id)
 
 
 def _kept(path: str, photo: StoredPhoto) -> ReferencePhoto:
     """Return a stored photo in the frame of its scene."""
-    from gsmap.localize.localization import max_sigmas
-
     one = photo.sighting
     camera = Cameras(one.T_scene_camera[None], one.intrinsics_px[None], np.array([one.size_px]))
     return ReferencePhoto(camera, partial(_picture, path, photo.number), *max_sigmas(one.covariance))
@@ -253,7 +204,7 @@ def _picture(path: str, number: int) -> np.ndarray:
     from gsmap.formats.pictures import open_picture
 
     try:
-        data = _store(path).photos.jpeg(number)
+        data = store_of(path).photos.jpeg(number)
         with open_picture(f"photo p{number}", data=data, formats=["JPEG"], max_pixels=_MAX_PIXELS) as picture:
             return np.asarray(picture.convert("RGB"))
     except InputError as error:
@@ -275,7 +226,7 @@ class TileMaker:
         budget_s: maximum wall time in seconds.
         captured_at: date of each scene.
         store: cache of reference views for other tiles.
-        passing: dynamic content to leave out, by scene id.
+        passing: content to leave out, by scene id.
         photos: reference photos, by scene id.
         unchanged: places of rejected changes, by scene id.
         cache_key: key of the merged tile among those of earlier exports (`gsmap.map.merged_tiles`).
@@ -288,7 +239,7 @@ class TileMaker:
     budget_s: float | None
     captured_at: Mapping[str, str | None]
     store: ReferenceViewCache
-    passing: Mapping[str, DynamicContent] = field(default_factory=dict)
+    passing: Mapping[str, OmittedContent] = field(default_factory=dict)
     photos: Mapping[str, Sequence[StoredPhoto]] = field(default_factory=dict)
     unchanged: Mapping[str, Sequence[UnchangedPlace]] = field(default_factory=dict)
     cache_key: str = ""
@@ -310,7 +261,7 @@ class TileMaker:
         from gsmap.merge.overlap import clamp_inside
         from gsmap.merge.tile import LazyScene, merge_tile
 
-        scenes, metres = _store(self.location).scenes, self.tile.metres_per_unit
+        scenes, metres = store_of(self.location).scenes, self.tile.metres_per_unit
         lazy = [
             LazyScene(
                 scene,

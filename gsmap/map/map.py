@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -352,11 +352,12 @@ class Map(AbstractContextManager["Map"]):
         return self._review(what, "withdraw" if withdraw else "reject", note)
 
     def _review(self, what: str, review: str, note: str) -> EdgeRow | ChangeRow:
-        from gsmap.map.changes import rows
+        from gsmap.map.changes.rows import change_row
+        from gsmap.store.changes import number_of
 
-        if (number := rows.change_number(what)) is not None:
+        if (number := number_of(what)) is not None:
             self.store.changes.review(number, review, note)
-            return rows.change_row(self.store, number)
+            return change_row(self.store, number)
         a, b = self._pair(what)
         self.store.registrations.review(a.id, b.id, review, note)
         return reports.edge_row(self.store, a, b)
@@ -744,6 +745,7 @@ class Map(AbstractContextManager["Map"]):
             BusyError: another export is at work in the folder; it is named.
             ConfigError, InputError, StoreError: see `gsmap.export`; no half-written tile is left.
         """
+        from gsmap.map.objects.static_filter import find_omitted
         from gsmap.map.stages.export import Request, export
 
         request = Request(
@@ -767,7 +769,15 @@ class Map(AbstractContextManager["Map"]):
             self._progress("export", fraction, text)
 
         known, told = self.static_content() if static else (None, ())
-        made, notes = export(self.store, Path(out), request, self.settings, progress, wait=wait, known=known)
+        made, notes = export(
+            self.store,
+            Path(out),
+            request,
+            self.settings,
+            progress,
+            wait=wait,
+            find_omitted=partial(find_omitted, known=known),
+        )
         return reports.export_report(self.store, Path(out), made, (*told, *notes))
 
     def export_survey(
@@ -800,6 +810,7 @@ class Map(AbstractContextManager["Map"]):
             ConfigError: several are, and none was chosen; or options that do not fit the kind of file.
             MissingDependencyError: laspy or ezdxf is not installed.
         """
+        from gsmap.map.objects.static_filter import find_omitted
         from gsmap.map.stages.export import Request
         from gsmap.map.world.survey_export import SurveyOptions, export_survey
         from gsmap.types.rows.exports import ExportReport
@@ -822,7 +833,7 @@ class Map(AbstractContextManager["Map"]):
             SurveyOptions(crs, pixel_size),
             self.settings,
             lambda fraction, text: self._progress("export", fraction, text),
-            known,
+            partial(find_omitted, known=known),
         )
         return ExportReport(out=os.fspath(out), tiles=(), recomputed=1, reused=0, removed=0, notes=(*told, *notes))
 
@@ -951,9 +962,11 @@ class Map(AbstractContextManager["Map"]):
 
     def status(self) -> MapStatus:
         """Report open tasks with the commands that resolve them (``gsmap status MAP``)."""
+        from gsmap.map.changes.rows import num_open
+        from gsmap.map.objects.static_filter import find_omitted
         from gsmap.map.status import status
 
-        return status(self.store, self.settings)
+        return status(self.store, self.settings, num_open, find_omitted)
 
     def show_scene(self, ref: str) -> SceneReport:
         """Report a scene with its nodes and edges (``gsmap show MAP SCENE``)."""
@@ -1212,6 +1225,7 @@ class Map(AbstractContextManager["Map"]):
         """
         from gsmap.map.stages.optimize import is_solved, solve
         from gsmap.map.world.georeference import georeference, take_back
+        from gsmap.map.world.rows import world_report
 
         notes: tuple[str, ...] = ()
         if request is not None or remove is not None:
@@ -1223,7 +1237,7 @@ class Map(AbstractContextManager["Map"]):
                     told, solution = georeference(self.store, request, self.settings, localise)
                     notes += told
                 solve(self.store, self.settings, self._progress, solution)
-        return reports.world_report(self.store, stale=not is_solved(self.store, self.settings), notes=notes)
+        return world_report(self.store, stale=not is_solved(self.store, self.settings), notes=notes)
 
     def set_world_position(
         self, scene: str, position: Sequence[float], sigma_m: tuple[float, float], crs: str = "EPSG:4326"
@@ -1361,9 +1375,16 @@ class Map(AbstractContextManager["Map"]):
             branches: also purge the map's other branches and tags; else they are listed.
         """
         from gsmap.map.map_operations import purge_report
+        from gsmap.map.page.export import SITES
+        from gsmap.map.page.source import cache_folder
+        from gsmap.map.pictures.comparison_pictures import PICTURES
+        from gsmap.map.report.output import REPORTS
+        from gsmap.map.small_map.export import SMALL_MAPS
         from gsmap.map.stages.purge import purge
+        from gsmap.view.tree_cache import TreeCache
 
-        return purge_report(purge(self.store, ref, branches=branches))
+        outputs, caches = (REPORTS, SITES, SMALL_MAPS, PICTURES), (TreeCache(cache_folder(), 0),)
+        return purge_report(purge(self.store, ref, outputs, caches, branches=branches))
 
     def restore_scene(self, ref: str, source: str | os.PathLike[str] | None = None) -> SceneRow:
         """Restore a removed scene (``gsmap restore-scene MAP SCENE``), or copy a scene from another map (``source``).

@@ -26,6 +26,7 @@ def look_up_scenes(
     graphs: Mapping[str, RecipeKey],
     asking: Sequence[str],
     params: retrieve.Params,
+    beside: Collection[str],
     progress: StageProgress,
 ) -> None:
     """Look scenes up in the index and store the candidates.
@@ -33,9 +34,10 @@ def look_up_scenes(
     Args:
         graphs: graph key of every scene to index.
         asking: ids of the query scenes.
+        beside: recipes of the other indexes of the map.
     """
     mine: dict[str, SceneNodes] = {}
-    index = _index(store, graphs, params, set(asking), mine)
+    index = _index(store, graphs, params, set(asking), mine, beside)
     for left in reversed(range(PATIENCE)):
         try:
             segments = index.update(lambda told: progress("register", 0.0, f"{told} of retrieval"))
@@ -95,14 +97,14 @@ def _index(
     params: retrieve.Params,
     asking: Collection[str] = (),
     read: dict[str, SceneNodes] | None = None,
+    beside: Collection[str] = (),
 ) -> SceneIndex:
     """Return the scene index of the graphs.
 
     Args:
         read: receives the query scenes that were read while they were indexed.
+        beside: recipes of the other indexes of the map.
     """
-
-    from gsmap import localize  # naming an edge does without
 
     def make(scenes: Sequence[str]) -> InMemory:
         new = [_voters(store, graphs[scene], params) for scene in scenes]
@@ -112,7 +114,7 @@ def _index(
         return retrieve.new_segment(new)
 
     keys = {scene: key.digest for scene, key in graphs.items()}
-    return SceneIndex(store, retrieve.index_recipe(params), {localize.index_recipe()}, keys, make)
+    return SceneIndex(store, retrieve.index_recipe(params), beside, keys, make)
 
 
 def _voters(store: Store, key: RecipeKey, params: retrieve.Params) -> SceneNodes:

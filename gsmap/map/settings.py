@@ -137,6 +137,13 @@ class Settings:
     view: view.Params = field(default=_params_of("gsmap.view"))
     engine: engine.Params = field(default=_params_of("gsmap.engine"))
 
+    def index_recipes(self) -> set[str]:
+        """Return the recipes of all indexes of a map."""
+        from gsmap.localize import index_recipe as recipe_of_views
+        from gsmap.retrieve import index_recipe
+
+        return {index_recipe(self.retrieve), recipe_of_views()}
+
 
 def settings_of(values: Mapping[str, Any], preset: str | None = None) -> Settings:
     """Return the defaults, changed by a preset and then by ``values``, which have dotted names.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from gsmap.map.changes.rows import num_open
 from gsmap.map.metric_scales import map_metres
 from gsmap.map.reports.one_pair import is_one_pair, scenes_by_one_pair
 from gsmap.map.settings import Settings
@@ -23,10 +23,20 @@ from gsmap.types.metric_scale import MetricScale
 from gsmap.types.rows.leases import LeaseRow
 from gsmap.types.rows.maps import MapStatus, MetricScaleRow, TodoKind, TodoRow
 
+if TYPE_CHECKING:
+    from gsmap.map.stages.export import FindOmitted
+
 
 @snapshot_read
-def status(store: Store, settings: Settings) -> MapStatus:
-    """Report the status of a map (``gsmap status MAP``) from the catalog, without computing anything."""
+def status(
+    store: Store, settings: Settings, num_open_changes: Callable[[Store, Settings], int], find_omitted: FindOmitted
+) -> MapStatus:
+    """Report the status of a map (``gsmap status MAP``) from the catalog, without computing anything.
+
+    Args:
+        num_open_changes: returns the number of unreviewed changes.
+        find_omitted: see `gsmap.map.stages.export.plan`.
+    """
     at = shlex.quote(store.location)
     update = f"gsmap update {at} --no-create"
     scenes = store.scenes.summaries()
@@ -70,7 +80,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
     if store.exports.targets():
         from gsmap.map.stages.export import dirty_tiles  # with merging, which a map that nobody exported does without
 
-        for target, (count, request) in dirty_tiles(store, settings).items():
+        for target, (count, request) in dirty_tiles(store, settings, find_omitted).items():
             verb = " ".join(["gsmap export", at, shlex.quote(target), *request.options()])
             add("dirty_tiles", count, verb, f"tiles in {target} that are out of date")
     poses = [pose for scene, pose in graph.poses.items() if scene in living]
@@ -89,7 +99,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
     undecided = [pair for pair in judged if living.issuperset(pair)]
     add("undecided", len(undecided), _look(store, undecided), "undecided edges: confirm or reject them")
     todo += quarantined_rows(store)
-    add("changes", num_open(store, settings), f"gsmap changes {at}", "unreviewed changes")
+    add("changes", num_open_changes(store, settings), f"gsmap changes {at}", "unreviewed changes")
     outweighed = [scene for scene in (newest.provenance.contradicted_priors if newest else ()) if scene in living]
     add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that contradict the edges")
     contrary = sum(row.use == "outlier" for tie in graph.world for row in tie.residuals)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -40,6 +41,13 @@ from gsmap.types.change import Change, ChangeReport
 from gsmap.types.plain import plain
 
 REVIEWS = ("confirm", "reject", "withdraw")
+_NUMBER = re.compile(r"c(\d{1,9})")
+
+
+def number_of(text: str) -> int | None:
+    """Parse the number of a change from its id (``c12``); None for other texts."""
+    found = _NUMBER.fullmatch(text)
+    return None if found is None else int(found[1])
 
 
 class Changes:

@@ -149,15 +149,15 @@ def test_a_pair_is_registered_once_from_its_lower_id_to_its_higher(site: Map, tr
 
 
 def test_jobs_see_the_map_that_lies_at_a_path_now(tmp_path: Path) -> None:
-    from gsmap.map.jobs import _store
+    from gsmap.map.jobs import store_of
 
     path = tmp_path / "site.gsmap"
     gsmap.map.create(path).close()
-    first = _store(str(path)).id
-    assert _store(str(path)).id == first
+    first = store_of(str(path)).id
+    assert store_of(str(path)).id == first
     shutil.rmtree(path)
     with gsmap.map.create(path) as m:
-        assert _store(str(path)).id == m.store.id != first
+        assert store_of(str(path)).id == m.store.id != first
 
 
 def test_pairs_of_a_removed_scene_are_refused(site: Map, tried: list[tuple[str, str]]) -> None:

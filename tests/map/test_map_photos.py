@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from gsmap.localize import ChangedRegion, PhotoComparison
-from gsmap.map.localization.photos import add_photo_observations, objects_in_photo
+from gsmap.map.localization.photos import objects_in_photo
 from gsmap.map.objects.map_objects import MapObjects, history_report, objects_report
+from gsmap.map.objects.photo_observations import add_photo_observations
 from gsmap.objects import estimate_persistence
 from gsmap.store.photos import StoredPhoto
 from gsmap.types import MapObject, ObjectObservation, Sim3

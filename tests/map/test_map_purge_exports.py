@@ -17,7 +17,7 @@ import gsmap.map
 from gsmap.durable import remove_staged, staged_folder, write_owned, write_text_output
 from gsmap.errors import GsmapError
 from gsmap.map import Map
-from gsmap.map.pictures.comparison_pictures import note_target
+from gsmap.map.outputs import note_target
 from gsmap.map.small_map.export import SmallLocalizer
 from gsmap.store import purging
 from gsmap.types import Cameras, PoseGraph, ScenePose, Sim3

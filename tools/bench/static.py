@@ -28,8 +28,7 @@ import numpy as np
 import gsmap.map
 from gsmap import formats
 from gsmap.map.changes.compare import standing_comparisons
-from gsmap.map.objects import static_filter
-from gsmap.map.objects.static_filter import DynamicContent
+from gsmap.map.objects.static_filter import DynamicContent, find_dynamic_content
 from gsmap.types import PoseGraph, ScenePose
 from tools.harness import argument_parser
 from tools.make.change_truth import Truth, owners
@@ -71,7 +70,7 @@ def score(truth: Truth) -> tuple[dict[str, Counter[str]], float]:
         started = time.process_time()
         known, _ = m.static_content()
         seconds = time.process_time() - started
-        passing = static_filter.find_dynamic_content(m.store, known, standing_comparisons(m.store, m.settings))
+        passing = find_dynamic_content(m.store, known, standing_comparisons(m.store, m.settings))
         changed = set()
         for a, b in combinations(truth.times, 2):
             for change in truth.changes(a, b):
@@ -83,7 +82,7 @@ def score(truth: Truth) -> tuple[dict[str, Counter[str]], float]:
             owner = owners(truth, when, means)
             kinds = {state["id"]: state["kind"] for state in truth.states(when)}
             for way in WAYS:
-                gone = static_filter.dynamic_rows(m.store, scene, _only(passing[scene], way))
+                gone = _only(passing[scene], way).rows(m.store, scene)
                 for piece in np.unique(owner[owner >= 0]).tolist():
                     mine = owner == piece
                     what = "changed" if piece in changed else "stayed" if kinds[piece] in _THINGS else "building"

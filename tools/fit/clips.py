@@ -34,8 +34,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from gsmap.geometry.uncertainty import max_sigmas
 from gsmap.localize import bundle_adjustment, joint_localization, verdict
-from gsmap.localize.localization import max_sigmas, rival_probability
+from gsmap.localize.localization import rival_probability
 from gsmap.localize.params import Params
 from gsmap.methods import family
 from gsmap.types.plain import canonical, plain

@@ -6,20 +6,21 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 
-from gsmap.change import recipe_key
+from gsmap import change
 from gsmap.engine import run_jobs
 from gsmap.errors import InputError, NotFoundError
 from gsmap.geometry.metric_scale import in_metres
+from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map.changes.visits import Visit, has_moved, pairs_of_visits
 from gsmap.map.date_filter import NO_DATE, parse_moment
-from gsmap.map.jobs import compare_scenes
+from gsmap.map.jobs import store_of
 from gsmap.map.metric_scales import metres_of_scenes
 from gsmap.map.settings import Settings
 from gsmap.map.shared_jobs import SharedJobs, note_interruption
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
 from gsmap.store.change_rows import Comparison
-from gsmap.types import Scene
+from gsmap.types import ChangeReport, PosedScene, Scene, Sim3
 from gsmap.types.progress import StageProgress
 
 _NAMED = 5  # scenes that a remark names
@@ -176,7 +177,8 @@ def _valid(current: Iterable[Comparison], asked: ComparisonPlan, settings: Setti
 def _key(settings: Settings, asked: ComparisonPlan, older: str, newer: str) -> RecipeKey:
     """Return the key of a pair's comparison, which depends on the metric scale."""
     metres = asked.visits[newer].metres_per_unit
-    return recipe_key(settings.change).of(older, newer, *([] if metres == 1.0 else [f"metres_per_unit {metres!r}"]))
+    scaled = [] if metres == 1.0 else [f"metres_per_unit {metres!r}"]
+    return change.recipe_key(settings.change).of(older, newer, *scaled)
 
 
 def _job(store: Store, asked: ComparisonPlan, settings: Settings, pair: tuple[str, str]) -> tuple[object, ...]:
@@ -189,3 +191,24 @@ def _names(names: Sequence[str]) -> str:
     """Return names with the matching form of ``have``."""
     shown = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
     return f"{shown} {'has' if len(names) == 1 else 'have'}"
+
+
+def compare_scenes(
+    path: str, older: tuple[str, Sim3, str], newer: tuple[str, Sim3, str], params: change.Params
+) -> tuple[ChangeReport, tuple[int, int]]:
+    """Compare two scenes of the map at ``path``; return the changes and the number of Gaussians of each.
+
+    Args:
+        older, newer: scene id, S_map_scene and date.
+    """
+    before, after = _posed(path, *older), _posed(path, *newer)
+    return change.compare(before, after, params), (len(before.gaussians), len(after.gaussians))
+
+
+def _posed(path: str, scene_id: str, S_map_scene: Sim3, captured_at: str) -> PosedScene:
+    """Return a scene in the map frame with its view-independent colour, which is all that comparisons use."""
+    scenes = store_of(path).scenes
+    gaussians, cameras = scenes.unread(scene_id).degree_0(), scenes.cameras(scene_id)
+    return PosedScene(
+        transform_gaussians(gaussians, S_map_scene), transform_cameras(cameras, S_map_scene), scene_id, captured_at
+    )

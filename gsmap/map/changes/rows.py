@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -19,6 +18,7 @@ from gsmap.map.settings import Settings
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
 from gsmap.store.change_rows import Comparison, StoredChange
+from gsmap.store.changes import number_of
 from gsmap.texts import counted
 from gsmap.types import Change, PoseGraph, Scene
 from gsmap.types.metric_scale import MetricScale
@@ -28,14 +28,6 @@ from gsmap.types.rows.pairs import PairEventRow
 if TYPE_CHECKING:
     from gsmap.map.changes.compare import ComparisonPlan
 
-_ID = re.compile(r"c(\d{1,9})")
-
-
-def change_number(text: str) -> int | None:
-    """Return the number of a change id such as ``c12``; None for other texts."""
-    found = _ID.fullmatch(text)
-    return None if found is None else int(found[1])
-
 
 def parse_change_id(text: str) -> int:
     """Return the number of a change id such as ``c12``.
@@ -43,7 +35,7 @@ def parse_change_id(text: str) -> int:
     Raises:
         NotFoundError: changes are not called so.
     """
-    number = change_number(text)
+    number = number_of(text)
     if number is None:
         raise NotFoundError(
             f"there is no change {text!r}: change ids are c1, c2, ... (gsmap changes MAP lists them)",

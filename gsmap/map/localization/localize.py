@@ -13,13 +13,12 @@ from typing import TypeVar
 import numpy as np
 
 from gsmap import localize as localizing
-from gsmap import retrieve
 from gsmap.engine import QuarantinedJob, run_jobs
 from gsmap.errors import ConfigError, CorruptError, DiskFullError, GsmapError, NotFoundError, ReadOnlyError
 from gsmap.geometry.metric_scale import in_metres
 from gsmap.localize import MapScene, ViewIndex, new_segment, view_index
 from gsmap.map import models
-from gsmap.map.jobs import features_of_scene
+from gsmap.map.jobs import staged, store_of
 from gsmap.map.metric_scales import map_metres
 from gsmap.map.scene_index import AT_ONCE, PATIENCE, SceneIndex
 from gsmap.map.settings import Settings
@@ -28,8 +27,10 @@ from gsmap.methods import RecipeKey, family
 from gsmap.methods.extractor import Extractor
 from gsmap.reason_codes import reason
 from gsmap.store import Store
+from gsmap.store.array_groups import StagedResult
 from gsmap.types import Gaussians, PoseGraph, Scene
 from gsmap.types.localization import LocalizationResult, Photo, SceneFeatures
+from gsmap.types.model import ModelSpec
 from gsmap.types.progress import StageProgress
 from gsmap.types.segments import InMemory
 from gsmap.types.source import ChunkSource
@@ -130,7 +131,7 @@ class Localizer:
         return SceneIndex(
             self.store,
             localizing.index_recipe(),
-            {retrieve.index_recipe(self.settings.retrieve)},
+            self.settings.index_recipes(),
             {scene: key.digest for scene, key in self.keys.items() if key.digest in kept or scene in self._held},
             self._segment,
         )
@@ -372,3 +373,27 @@ def localize_all(
     found = localizer.localize_together(photos, near)
     seconds = (time.monotonic() - began) / max(len(photos), 1)
     return iter([(one, seconds) for one in found])
+
+
+def features_of_scene(
+    path: str,
+    scene_id: str,
+    specs: Mapping[str, ModelSpec],
+    params: localizing.Params,
+    key: RecipeKey,
+    inbox: str | None,
+) -> SceneFeatures | StagedResult:
+    """Extract the features of the views of one scene of the map at ``path``.
+
+    Args:
+        key: recipe of the features.
+        inbox: see `staged`; None for features that are not stored.
+    """
+    store = store_of(path)
+    scenes = store.scenes
+    extractor = family("extractor").get(params.extractor).make(specs, params.extractors[params.extractor])
+    gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
+    found = localizing.scene_features(scene_id, gaussians, cameras, extractor, params.views)
+    if inbox is None:
+        return found
+    return staged(store.view_features, found, key, inbox)

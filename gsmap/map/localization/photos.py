@@ -1,4 +1,4 @@
-"""Report the photos stored in a map as rows, and derive their object observations."""
+"""Record localized photos with the objects that they show, and report stored photos as rows."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from PIL import Image
 from gsmap.geometry.projection import in_image, project
 from gsmap.geometry.transforms import transform_poses
 from gsmap.localize import PhotoComparison
-from gsmap.map.date_filter import capture_time
 from gsmap.map.localization.photo_poses import photo_pose_of
 from gsmap.store import Store
-from gsmap.store.photos import MAX_BYTES, StoredPhoto
-from gsmap.types import MapObject, ObjectObservation, Scene, SceneGraph, Sim3
+from gsmap.store.photos import MAX_BYTES
+from gsmap.types import MapObject, SceneGraph, Sim3
 from gsmap.types.localization import Photo
 from gsmap.types.localized_photo import LocalizedPhoto, PhotoObjectObservation
 from gsmap.types.rows.localize import LocalizeRow, PhotoChangeRow, PhotoRow
@@ -28,7 +27,6 @@ _ON_SURFACE_M = 0.12  # distance of a sample of an object from the rendered surf
 _MIN_SAMPLES, _MIN_VISIBLE_FRACTION = 8, 0.1  # of an object that must be visible for it to be judged
 _MIN_SEEN_FRACTION = 0.6  # of the visible samples that must agree with the map for the object to be seen
 _MIN_GONE_FRACTION = 0.5  # of the visible samples that must lie in changed regions for it to be absent
-_SAME_PLACE_M = 0.15  # distance of an observation from the box of its object
 _SIDE_PX = 960  # of the picture that is kept: as large as captures are rendered for the merged map to look like
 
 
@@ -160,59 +158,6 @@ def _points(
         mine = np.repeat(np.arange(len(graph.segments)), graph.segments.sample_counts) == sighting.thing
         return poses[sighting.scene].apply(graph.segments.samples[mine])
     return None
-
-
-def add_photo_observations(
-    objects: Sequence[MapObject],
-    kept: Sequence[StoredPhoto],
-    scenes: Mapping[str, Scene],
-    poses: Mapping[str, Sim3],
-    metres: Mapping[int, float],
-    components: Mapping[str, int],
-) -> list[MapObject]:
-    """Add the observations of stored photos to objects, in the order of dates.
-
-    What a photo said of a thing holds for the object that stands or stood at that place.
-
-    Args:
-        poses: ``S_map_scene`` by scene id. components: the same of components.
-        metres: per unit, by component.
-    """
-    said: dict[int, dict[str, ObjectObservation]] = {}
-    for photo in kept:
-        one = photo.sighting
-        if one.scene not in poses:
-            continue
-        component = components[one.scene]
-        for thing in one.things:
-            at = poses[one.scene].apply(thing.position)
-            number = _at(objects, component, at, _SAME_PLACE_M / metres[component])
-            if number is not None:
-                sighting = ObjectObservation(one.digest, thing.state, -1, None, thing.share)
-                said.setdefault(number, {}).setdefault(one.digest, sighting)
-    whens = {scene.id: capture_time(scene.captured_at, scene.ingested_at) for scene in scenes.values()}
-    whens |= {photo.sighting.digest: capture_time(photo.sighting.captured_at, photo.created_at) for photo in kept}
-    out = list(objects)
-    for number, sightings in said.items():
-        everything = [*objects[number].sightings, *sightings.values()]
-        ordered = sorted(everything, key=lambda sighting: whens[sighting.scene])
-        out[number] = replace(objects[number], sightings=tuple(ordered))
-    return out
-
-
-def _at(objects: Sequence[MapObject], component: int, at: np.ndarray, near: float) -> int | None:
-    """Return the index of the object at a point; among several objects, the one with the nearest box centre."""
-    best, far = None, np.inf
-    for number, thing in enumerate(objects):
-        if thing.component != component:
-            continue
-        for sighting in thing.sightings:
-            if sighting.box is None or not ((at >= sighting.box[0] - near) & (at <= sighting.box[1] + near)).all():
-                continue
-            distance = float(np.linalg.norm(at - sighting.box.mean(0)))
-            if distance < far:
-                best, far = number, distance
-    return best
 
 
 def photo_rows(store: Store) -> list[PhotoRow]:

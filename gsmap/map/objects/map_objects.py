@@ -18,9 +18,9 @@ from gsmap.durable import write_text_output
 from gsmap.errors import ConfigError, DiskFullError, InputError, NotFoundError, ReadOnlyError
 from gsmap.geometry.directions import level_frame
 from gsmap.map.date_filter import capture_time
-from gsmap.map.localization.photos import add_photo_observations
 from gsmap.map.objects.annotations import apply_annotations, why_distinct
 from gsmap.map.objects.associate import ComponentObjects, objects_of_components
+from gsmap.map.objects.photo_observations import add_photo_observations
 from gsmap.map.settings import Settings
 from gsmap.objects import estimate_persistence, graphml, object_graph, relations
 from gsmap.store import Store

@@ -5,7 +5,7 @@ A thing persists as far as it was looked for: one that was seen in every look is
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -22,6 +22,7 @@ from gsmap.types.plain import canonical
 
 if TYPE_CHECKING:
     from gsmap.map.objects.map_objects import MapObjects
+    from gsmap.map.settings import Settings
 
 _OF_THINGS = ("appeared", "disappeared", "moved", "replaced")
 """Kinds of changes that concern objects; recoloured surfaces and other lighting are static content."""
@@ -31,7 +32,7 @@ _SAME_PLACE = 0.1  # of a thing that stayed, the box that one capture shows hold
 
 @dataclass(frozen=True)
 class DynamicContent:
-    """The segments and changes of one scene that are not static; `dynamic_rows` returns their Gaussians.
+    """The segments and changes of one scene that are not static; see `gsmap.map.jobs.OmittedContent`.
 
     Args:
         graph: key of the graph with the segments; empty if there are none.
@@ -51,6 +52,34 @@ class DynamicContent:
         if not self.things and not self.changes:
             return ""
         return text_digest(canonical([self.graph, self.things, [change[1:] for change in self.changes], self.told]))
+
+    def rows(self, store: Store, scene: str) -> np.ndarray:
+        """Return a mask (N,) that is True for the dynamic Gaussians of a scene.
+
+        Raises:
+            NotFoundError: its segments or changes were pruned meanwhile.
+        """
+        out = np.zeros(store.scenes.get(scene).num_gaussians, bool)
+        for number in dict.fromkeys(change[0] for change in self.changes):
+            found = store.changes.load(number).changes
+            for _, place, side in (change for change in self.changes if change[0] == number):
+                out[found[place].before if side == "before" else found[place].after] = True
+        graph = store.graphs.load(scene, self.graph) if self.graph else None
+        if self.graph and graph is None:
+            raise NotFoundError(
+                f"the segments of scene {scene[:12]} were deleted meanwhile: run the same export again",
+                code="changed_meanwhile",
+            )
+        if graph is not None and graph.segments is not None and len(graph.segments):
+            from gsmap.objects.changed_segments import CHANGED  # naming what passes does without
+
+            members = graph.segments.members
+            of = np.bincount(members[members >= 0], minlength=len(graph.segments))
+            changed = np.bincount(members[out & (members >= 0)], minlength=len(graph.segments))
+            # Below that share the change is of a part, or of what stands by it.
+            whole = np.flatnonzero(changed >= CHANGED * np.maximum(of, 1))
+            out |= np.isin(members, np.union1d(whole, np.array(self.things, np.int64)))
+        return out
 
 
 def is_dynamic(thing: MapObject) -> bool:
@@ -108,35 +137,24 @@ def find_dynamic_content(store: Store, known: MapObjects, standing: Sequence[Com
     }
 
 
-def dynamic_rows(store: Store, scene: str, passing: DynamicContent) -> np.ndarray:
-    """Return a mask (N,) that is True for the dynamic Gaussians of a scene.
+def find_omitted(
+    store: Store, settings: Settings, scenes: Collection[str], known: MapObjects | None = None
+) -> tuple[dict[str, DynamicContent], tuple[str, ...]]:
+    """Return the dynamic content of some of the placed scenes, and notes on it (`gsmap.map.stages.export.FindOmitted`).
 
-    Raises:
-        NotFoundError: its segments or changes were pruned meanwhile.
+    Args:
+        known: objects of the map; default: the stored ones.
     """
-    out = np.zeros(store.scenes.get(scene).num_gaussians, bool)
-    for number in dict.fromkeys(change[0] for change in passing.changes):
-        found = store.changes.load(number).changes
-        for _, place, side in (change for change in passing.changes if change[0] == number):
-            out[found[place].before if side == "before" else found[place].after] = True
-    graph = store.graphs.load(scene, passing.graph) if passing.graph else None
-    if passing.graph and graph is None:
-        raise NotFoundError(
-            f"the segments of scene {scene[:12]} were deleted meanwhile: run the same export again",
-            code="changed_meanwhile",
-        )
-    if graph is not None and graph.segments is not None and len(graph.segments):
-        from gsmap.objects.changed_segments import CHANGED  # naming what passes does without
+    from gsmap.map.changes.compare import standing_comparisons  # both only for exports of static content
+    from gsmap.map.objects.map_objects import load_objects
 
-        members = graph.segments.members
-        of = np.bincount(members[members >= 0], minlength=len(graph.segments))
-        changed = np.bincount(members[out & (members >= 0)], minlength=len(graph.segments))
-        whole = np.flatnonzero(changed >= CHANGED * np.maximum(of, 1))  # else it is of a part, or of what stands by it
-        out |= np.isin(members, np.union1d(whole, np.array(passing.things, np.int64)))
-    return out
+    known = load_objects(store, settings) if known is None else known
+    found = find_dynamic_content(store, known, standing_comparisons(store, settings))
+    passing = {scene: one for scene, one in found.items() if scene in scenes}
+    return passing, tuple(_notes(known, passing))
 
 
-def dynamic_notes(known: MapObjects, passing: Mapping[str, DynamicContent]) -> list[str]:
+def _notes(known: MapObjects, passing: Mapping[str, DynamicContent]) -> list[str]:
     """Return notes on the dynamic content that is left out."""
     every = [*known.objects, *known.building]
     gone = [thing for thing in every if is_dynamic(thing)]

@@ -27,8 +27,8 @@ from gsmap.durable import (
     write_owned,
 )
 from gsmap.errors import MALFORMED, ConfigError, CorruptError, NotFoundError
+from gsmap.map.outputs import Output, note_target
 from gsmap.map.page.source import MapPageSource, cache_folder
-from gsmap.map.pictures.comparison_pictures import note_target
 from gsmap.map.settings import Settings
 from gsmap.report import owner_mark, owner_of
 from gsmap.store import Store
@@ -118,25 +118,34 @@ def site_owner(folder: Path) -> str | None:
     return None if said is None else said[0]
 
 
-def remove_site(folder: Path) -> int:
-    """Delete the files of a page, no other files, and folders that become empty; return the number of files.
+def remove_site(folder: Path) -> None:
+    """Delete the files of a page, no other files, and folders that become empty.
 
     Raises:
         CorruptError: a folder on the way to one is a link.
         OSError: the system refused.
     """
-    files = site_files(folder)
-    _remove(folder, files)
+    _remove(folder, site_files(folder))
     remove_file(folder, SITE)  # last: an interrupted call finds the rest again
     sync_folder(folder)
     remove_empty_folder(folder.parent, folder.name)
-    return len(files) + 1
 
 
 def site_files(folder: Path) -> list[str]:
     """List the files of a page except `SITE`, relative to its folder; empty if the folder has no page."""
     said = _marker(folder)
     return [] if said is None else said[1]
+
+
+def _num_files(folder: Path, map_id: str, scene: str) -> int:
+    return len(site_files(folder)) + 1 if site_owner(folder) == map_id else 0
+
+
+SITES = Output(
+    is_at=lambda folder, map_id: os.path.lexists(folder / SITE),
+    num_files=_num_files,
+    forget=lambda folder, map_id, scene: remove_site(folder),  # it shows all scenes; gsmap view --export makes it anew
+)
 
 
 def _marker(folder: Path) -> tuple[str, list[str]] | None:

@@ -10,16 +10,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from gsmap.durable import make_folder, open_file, remove_file, remove_staged, write_output, write_owned
-from gsmap.errors import MALFORMED, ConfigError, DiskFullError, InputError, ReadOnlyError
+from gsmap.errors import MALFORMED, ConfigError, InputError
 from gsmap.geometry.metric_scale import in_metres
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map.changes.rows import change_arrays, parse_change_id
 from gsmap.map.metric_scales import metres_of_scenes
+from gsmap.map.outputs import Output, note_target
 from gsmap.methods import text_digest
 from gsmap.register.view_cache import ViewCache
 from gsmap.store import Store
@@ -88,15 +88,23 @@ class PictureFolder:
         self.scenes |= scenes
         self.save(folder)
 
-    def forget(self, folder: Path, scene: str) -> int:
-        """Delete the images that show a scene; return their number."""
-        gone = [name for name, ids in self.scenes.items() if scene in ids]
-        for name in gone:
+    def of_scene(self, scene: str) -> list[str]:
+        """Return the images that show a scene."""
+        return [name for name, ids in self.scenes.items() if scene in ids]
+
+    def forget(self, folder: Path, scene: str) -> None:
+        """Delete the images that show a scene."""
+        for name in self.of_scene(scene):
             remove_file(folder, name)
             del self.scenes[name]
-        if gone:
-            self.save(folder)
-        return len(gone)
+        self.save(folder)
+
+
+PICTURES = Output(
+    is_at=lambda folder, map_id: os.path.lexists(folder / FILE_NAME),
+    num_files=lambda folder, map_id, scene: len(PictureFolder.load(folder, map_id).of_scene(scene)),
+    forget=lambda folder, map_id, scene: PictureFolder.load(folder, map_id).forget(folder, scene),
+)
 
 
 def draw(store: Store, folder: Path, rows: Sequence[ChangeRow], progress: StageProgress) -> dict[str, str]:
@@ -300,16 +308,3 @@ def posed_scene(store: Store, scene: str, S: Sim3) -> PosedScene:
     """Read a scene and transform it by ``S``."""
     gaussians, cameras = store.scenes.gaussians(scene), store.scenes.cameras(scene)
     return PosedScene(transform_gaussians(gaussians, S), transform_cameras(cameras, S), scene)
-
-
-def note_target(store: Store, path: Path, settings: Mapping[str, Any]) -> str | None:
-    """Record a folder or file that shows scenes, so that a purge finds it; return the reason for a failure, or None."""
-    if str(path.resolve()) in {one.target for one in store.exports.list()}:
-        return None
-    if not store.catalog.writable:
-        return f"{store.location} is read-only"
-    try:
-        store.exports.begin(path, revision=None, settings=settings)
-    except (DiskFullError, ReadOnlyError) as error:
-        return str(error)
-    return None

@@ -21,11 +21,13 @@ from gsmap.geometry.rotations import angle_between
 from gsmap.geometry.uncertainty import largest_sigma, middle_covariance_m2
 from gsmap.map import reports
 from gsmap.map.changes.compare import plan_comparisons
-from gsmap.map.changes.rows import changes_report, filter_by_date
+from gsmap.map.changes.rows import changes_report, filter_by_date, num_open
 from gsmap.map.date_filter import is_after, parse_moment
 from gsmap.map.metric_scales import map_metres
 from gsmap.map.objects.map_objects import load_objects, objects_report
-from gsmap.map.pictures.comparison_pictures import PairRenderer, note_target, picture_of_pair
+from gsmap.map.objects.static_filter import find_omitted
+from gsmap.map.outputs import note_target
+from gsmap.map.pictures.comparison_pictures import PairRenderer, picture_of_pair
 from gsmap.map.pictures.floor_plans import MAX_GAUSSIANS, MAX_SCENES, SceneArrays, box_of, plan_of_component, read_scene
 from gsmap.map.report.edge_entries import edge_entries
 from gsmap.map.reports.common import up_directions
@@ -314,7 +316,7 @@ def _read_catalog(store: Store, builder: _ReportBuilder) -> Report:
         map_id=store.id,
         made_at=datetime.now(UTC).isoformat(timespec="seconds"),
         version=__version__,
-        status=_hide_places(status(store, settings), builder.places),
+        status=_hide_places(status(store, settings, num_open, find_omitted), builder.places),
         scenes=tuple(SceneEntry(row, num_bytes.get(row.id, 0)) for row in rows),
         edges=tuple(entry for entry, _ in edges),
         islands=tuple(Island(one, tuple(names[one]), builder.metres[one]) for one in sorted(names)),

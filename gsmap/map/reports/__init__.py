@@ -14,7 +14,6 @@ from gsmap.map.reports.revisions import (
 )
 from gsmap.map.reports.scenes import SCENE_STATUSES, ingest_row, pose_rows, scene_row, scene_rows
 from gsmap.map.reports.upkeep import export_report, model_rows, setting_rows, tile_rows
-from gsmap.map.reports.world import world_report
 
 __all__ = [
     "EDGE_STATUSES",
@@ -45,5 +44,4 @@ __all__ = [
     "setting_rows",
     "tile_rows",
     "update_report",
-    "world_report",
 ]

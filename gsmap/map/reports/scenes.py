@@ -7,9 +7,9 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from gsmap.map.date_filter import end_of_date, is_after, is_until, parse_moment
+from gsmap.map.georeferenced_components import world_positions
 from gsmap.map.reports.common import one_of
 from gsmap.map.reports.one_pair import ONE_PAIR, scenes_by_one_pair
-from gsmap.map.reports.world import world_positions
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.store import Store
 from gsmap.types import Scene, ScenePose, Sim3

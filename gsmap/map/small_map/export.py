@@ -31,7 +31,7 @@ from gsmap.durable import (
     sync_folder,
     write_owned,
 )
-from gsmap.errors import MALFORMED, ConfigError, CorruptError, GsmapError, NotFoundError, StoreError
+from gsmap.errors import MALFORMED, ConfigError, CorruptError, GsmapError, InputError, NotFoundError, StoreError
 from gsmap.export.levels import Params as LevelParams
 from gsmap.export.levels import make_level
 from gsmap.formats.quantise import check_size
@@ -48,10 +48,9 @@ from gsmap.localize import (
 from gsmap.localize.features import INDEXED_FEATURES
 from gsmap.map.changes.compare import standing_comparisons
 from gsmap.map.localization.localize import Localizer, SearchRegion
-from gsmap.map.objects import static_filter
 from gsmap.map.objects.map_objects import MapObjects
-from gsmap.map.objects.static_filter import find_dynamic_content
-from gsmap.map.pictures.comparison_pictures import note_target
+from gsmap.map.objects.static_filter import DynamicContent, find_dynamic_content
+from gsmap.map.outputs import Output, note_target
 from gsmap.map.settings import Settings, settings_of
 from gsmap.methods import family
 from gsmap.store import Store
@@ -200,7 +199,7 @@ class _SceneContent:
 
 
 def _scene_content(
-    localizer: Localizer, scene: str, passing: static_filter.DynamicContent | None, standing: Sequence[Comparison]
+    localizer: Localizer, scene: str, passing: DynamicContent | None, standing: Sequence[Comparison]
 ) -> _SceneContent:
     """Return the content of a scene that a small map may store.
 
@@ -215,7 +214,7 @@ def _scene_content(
     if passing is None:
         gone = _removed(store, scene, standing)
     else:
-        gone = static_filter.dynamic_rows(store, scene, passing)
+        gone = passing.rows(store, scene)
         features = reduction.remove_features(features, placed.gaussians.means, gone)
     weights, coloured = reduction.measure_visibility(placed, own)
     kept = coloured[np.flatnonzero((weights >= reduction.MIN_BLENDING_WEIGHT) & ~np.asarray(gone))]
@@ -344,13 +343,15 @@ def owner_of(folder: Path) -> str | None:
         return None
 
 
-def num_files(folder: Path, scene: str) -> int:
+def _num_files(folder: Path, map_id: str, scene: str) -> int:
     """Return the number of files that are about a scene: its own, and the list of all scenes if it names it."""
+    if owner_of(folder) != map_id:
+        raise InputError("it holds a small map that this map or version of gsmap did not write", code="foreign_export")
     listed = any(row["id"] == scene for row in _read_header(folder / FILE_NAME)["scenes"])
     return int(listed) + int(is_file(folder / f"{scene}.npz"))
 
 
-def forget(folder: Path, scene: str) -> None:
+def _forget(folder: Path, map_id: str, scene: str) -> None:
     """Delete a scene from a small map; the last one with the folder.
 
     The list goes first, so that an interrupted call leaves a small map that works, and the same call goes on.
@@ -359,12 +360,17 @@ def forget(folder: Path, scene: str) -> None:
     left = [row for row in told["scenes"] if row["id"] != scene]
     if left and len(left) < len(told["scenes"]):
         text = json.dumps(told | {"scenes": left})
-        write_owned(folder / FILE_NAME, told["map_id"], lambda staged: staged.write_text(text, encoding="utf-8"))
+        write_owned(folder / FILE_NAME, map_id, lambda staged: staged.write_text(text, encoding="utf-8"))
     remove_file(folder, f"{scene}.npz")
     if not left:
         remove_file(folder, FILE_NAME)
     sync_folder(folder)
     remove_empty_folder(folder.parent, folder.name)
+
+
+SMALL_MAPS = Output(
+    is_at=lambda folder, map_id: os.path.lexists(folder / FILE_NAME), num_files=_num_files, forget=_forget
+)
 
 
 # --- read ------------------------------------------------------------------------------------------------------------

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,12 +22,10 @@ from gsmap.export.pyramid import TreeLayout, is_stale, remove_tree_files
 from gsmap.export.streamed_sog import StreamedSog, write_streams
 from gsmap.export.tileset import Tiles3D, write_tilesets, write_whole_map
 from gsmap.geometry.transforms import transform_cameras
-from gsmap.map.changes.compare import standing_comparisons
 from gsmap.map.date_filter import end_of_date, is_until, undated_note
 from gsmap.map.georeferenced_components import GeoreferencedComponent, georeferenced_components, world_notes
-from gsmap.map.jobs import TileMaker
+from gsmap.map.jobs import OmittedContent, TileMaker
 from gsmap.map.metric_scales import map_metres, metre_notes
-from gsmap.map.objects.static_filter import DynamicContent, dynamic_notes, find_dynamic_content
 from gsmap.map.rejected_changes import places_near, rejected_places
 from gsmap.map.settings import Settings
 from gsmap.map.shared_jobs import note_interruption
@@ -43,10 +41,10 @@ from gsmap.types.metric_scale import MetricScale
 from gsmap.types.plain import canonical, plain
 from gsmap.types.progress import Progress
 
-if TYPE_CHECKING:
-    from gsmap.map.objects.map_objects import MapObjects
-
 _log = logging.getLogger("gsmap.export")
+
+FindOmitted = Callable[[Store, Settings, Collection[str]], tuple[Mapping[str, OmittedContent], tuple[str, ...]]]
+"""A function that returns the content of scenes (ids) to leave out of an export of static content, and notes on it."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,7 @@ class ExportPlan:
         notes: remarks for the user.
         metres: metric scale of each component.
         world: georeferenced components.
-        passing: dynamic content to leave out of each scene.
+        passing: content to leave out of each scene.
         photos: reference photos by component and tile name.
         unchanged: places of rejected changes near a tile, by scene id, by component and tile name.
     """
@@ -119,16 +117,16 @@ class ExportPlan:
     notes: tuple[str, ...] = ()
     metres: Mapping[int, MetricScale] = field(default_factory=dict)
     world: Mapping[int, GeoreferencedComponent] = field(default_factory=dict)
-    passing: Mapping[str, DynamicContent] = field(default_factory=dict)
+    passing: Mapping[str, OmittedContent] = field(default_factory=dict)
     photos: Mapping[tuple[int, str], Sequence[StoredPhoto]] = field(default_factory=dict)
     unchanged: Mapping[tuple[int, str], Mapping[str, Sequence[UnchangedPlace]]] = field(default_factory=dict)
 
 
-def plan(store: Store, request: Request, settings: Settings, known: MapObjects | None = None) -> ExportPlan:
+def plan(store: Store, request: Request, settings: Settings, find_omitted: FindOmitted | None = None) -> ExportPlan:
     """Plan the tiles of an export from the catalog.
 
     Args:
-        known: objects of the map, for dynamic content; default: the stored ones.
+        find_omitted: needed for an export of static content.
     """
     method = request.merge or settings.merge.method
     params = settings.merge.mergers[method]
@@ -161,15 +159,12 @@ def plan(store: Store, request: Request, settings: Settings, known: MapObjects |
 
         notes += undated_notes(store, scenes.values())
         rejected = rejected_places(store.changes.current(), scenes, placed, metres)
-    passing: dict[str, DynamicContent] = {}
+    passing: Mapping[str, OmittedContent] = {}
     if request.static:
-        from gsmap.map.objects.map_objects import load_objects
-
-        known = load_objects(store, settings) if known is None else known
-        found = find_dynamic_content(store, known, standing_comparisons(store, settings))
-        passing = {scene: one for scene, one in found.items() if scene in scenes}
+        assert find_omitted is not None
+        passing, told = find_omitted(store, settings, scenes)
         recipe = replace(recipe, without={scene: one.digest for scene, one in passing.items() if one.digest})
-        notes += tuple(dynamic_notes(known, passing))
+        notes += told
     exported = {pose.component for pose in placed.values()}
     metres = {component: metre for component, metre in metres.items() if component in exported}
     notes += metre_notes(metres)
@@ -253,7 +248,7 @@ def export(
     progress: Progress,
     *,
     wait: bool = False,
-    known: MapObjects | None = None,
+    find_omitted: FindOmitted | None = None,
 ) -> tuple[ExportResult, tuple[str, ...]]:
     """Plan the tiles, make and write the dirty tiles, and record their recipes in the store.
 
@@ -262,7 +257,7 @@ def export(
 
     Args:
         wait: wait while another export runs in the folder.
-        known: see `plan`.
+        find_omitted: see `plan`.
 
     Returns:
         What was made, and what a person should know of what took part.
@@ -270,7 +265,7 @@ def export(
     Raises:
         BusyError: another export is at work in the folder.
     """
-    planned = plan(store, request, settings, known)
+    planned = plan(store, request, settings, find_omitted)
     waited = False
 
     def waiting(text: str) -> None:
@@ -280,7 +275,7 @@ def export(
 
     with folder_lock(out, wait=wait, waiting=waiting), store.leases.announce("export", f"export {out.resolve()}"):
         if waited:
-            planned = plan(store, request, settings, known)  # the map may have other poses now
+            planned = plan(store, request, settings, find_omitted)  # the map may have other poses now
         result, note = _export(store, out, request, planned, settings, progress)
         return result, (*planned.notes, *[note] * bool(note))
 
@@ -434,7 +429,7 @@ def _put_aside(store: Store, out: Path, planned: ExportPlan, result: ExportResul
             store.quarantine.add(what, about, f"component_{tile.component}/{tile.name}: {reason}")
 
 
-def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Request]]:
+def dirty_tiles(store: Store, settings: Settings, find_omitted: FindOmitted) -> dict[str, tuple[int, Request]]:
     """Return, for each export folder, the number of tiles that a repeated export would make or remove, and the row of
     the last export.
 
@@ -450,7 +445,7 @@ def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Reques
         request = Request(**{key: value for key, value in stored.items() if key in known})
         old = {(tile.component, Path(tile.path).name.partition(".")[0]): tile for tile in store.exports.tiles(target)}
         try:
-            planned = plan(store, request, settings)
+            planned = plan(store, request, settings, find_omitted)
         except GsmapError as error:  # what was exported then cannot be now: its verb will say why
             if error.code == "objects_outdated" and old:
                 found[target] = len(old), request

@@ -6,11 +6,11 @@ import os
 import re
 from collections.abc import Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 from gsmap.durable import (
     files_below,
-    is_file,
     is_folder,
     refuse_links,
     remove_empty_folder,
@@ -27,25 +27,27 @@ from gsmap.export.streamed_sog import StreamedSog
 from gsmap.export.tileset import Tiles3D
 from gsmap.export.write import leftovers
 from gsmap.map import merged_tiles
-from gsmap.map.page.export import SITE, remove_site, site_files, site_owner
-from gsmap.map.page.source import cache_folder
-from gsmap.map.pictures.comparison_pictures import FILE_NAME as PICTURES
-from gsmap.map.pictures.comparison_pictures import PictureFolder
-from gsmap.map.small_map import export as small_map
-from gsmap.report import owner_of
+from gsmap.map.outputs import Output, SceneCache
 from gsmap.store import Store, purging
 from gsmap.store.purging import Purge
-from gsmap.view.tree_cache import TreeCache
 
 _COMPONENT = re.compile(r"component_\d+")
 _TREES = (Tiles3D(), StreamedSog())
 
 
-def purge(store: Store, ref: str, *, branches: bool = False) -> list[tuple[str, Purge]]:
+def purge(
+    store: Store,
+    ref: str,
+    outputs: Sequence[Output] = (),
+    caches: Sequence[SceneCache] = (),
+    *,
+    branches: bool = False,
+) -> list[tuple[str, Purge]]:
     """Purge a scene; interrupted purges are finished first.
 
     Args:
         ref: name, id, or the beginning of an id, of a living or a removed scene; of one that was purged its id.
+        outputs: kinds of outputs besides tiles. caches: caches besides that of merged tiles.
         branches: in the other branches and tags of the map, too.
 
     Returns:
@@ -57,11 +59,12 @@ def purge(store: Store, ref: str, *, branches: bool = False) -> list[tuple[str, 
         StoreError: a branch cannot be read, somebody reads an older state, or a folder of tiles or pictures failed; the
             same call again goes on.
     """
+    finish = partial(_finish, outputs=outputs, caches=caches)
     with ExitStack() as stack:
         catalogs = [store]
         if branches:
             catalogs += [stack.enter_context(Store.open_writable(place.location)) for place in store.others()]
-        done = [(one, _finish(one, p)) for one in catalogs for p in purging.list_purges(one) if not p.is_done]
+        done = [(one, finish(one, p)) for one in catalogs for p in purging.list_purges(one) if not p.is_done]
         scene = _scene(catalogs, ref)
         if scene is None:
             done = done or [(one, p) for one in catalogs for p in purging.list_purges(one) if p.scene == ref]
@@ -73,7 +76,7 @@ def purge(store: Store, ref: str, *, branches: bool = False) -> list[tuple[str, 
         else:
             holding = [one for one in catalogs if _holds(one, scene)]
             begun = [(one, purging.begin(one, scene)) for one in holding]
-            done = [(one, _finish(one, one_purge)) for one, one_purge in begun]
+            done = [(one, finish(one, one_purge)) for one, one_purge in begun]
         for one in catalogs:
             purging.update_receipts(one)
         return [(one.location, p) for one, made in done for p in purging.list_purges(one) if p.number == made.number]
@@ -95,12 +98,12 @@ def _holds(store: Store, scene: str) -> bool:
         return False
 
 
-def _finish(store: Store, begun: Purge) -> Purge:
+def _finish(store: Store, begun: Purge, outputs: Sequence[Output], caches: Sequence[SceneCache]) -> Purge:
     unreachable = []
-    levels = TreeCache(cache_folder(), 0)
-    if num_files := levels.num_files(begun.scene):
-        begun = purging.record_files(store, begun, str(levels.root), num_files)
-        levels.forget(begun.scene)
+    for cache in caches:
+        if num_files := cache.num_files(begun.scene):
+            begun = purging.record_files(store, begun, str(cache.root), num_files)
+            cache.forget(begun.scene)
     if cached := merged_tiles.files_of(begun.scene):
         begun = purging.record_files(store, begun, str(merged_tiles.folder()), len(cached))
         for path in cached:
@@ -113,22 +116,10 @@ def _finish(store: Store, begun: Purge) -> Purge:
             if os.path.lexists(out / FILE_NAME):
                 with folder_lock(out):
                     begun = _clean(store, out, begun)
-            elif is_file(out) and owner_of(out) == store.id:
-                remove_file(out.parent, out.name)  # it shows all scenes; gsmap report makes it anew
-                begun = purging.record_files(store, begun, str(out), 1)
-            elif os.path.lexists(out / SITE):
-                if site_owner(out) == store.id:  # it shows all scenes; gsmap view --export makes it anew
-                    begun = purging.record_files(store, begun, str(out), len(site_files(out)) + 1)
-                    remove_site(out)
-            elif os.path.lexists(out / small_map.FILE_NAME):
-                if small_map.owner_of(out) == store.id:
-                    begun = purging.record_files(store, begun, str(out), small_map.num_files(out, begun.scene))
-                    small_map.forget(out, begun.scene)
-                else:
-                    unreachable.append(f"{out}: it holds a small map that this map or version of gsmap did not write")
-            elif os.path.lexists(out / PICTURES):
-                if gone := PictureFolder.load(out, store.id).forget(out, begun.scene):
-                    begun = purging.record_files(store, begun, str(out), gone)
+            elif (kind := next((one for one in outputs if one.is_at(out, store.id)), None)) is not None:
+                if num_files := kind.num_files(out, store.id, begun.scene):
+                    begun = purging.record_files(store, begun, str(out), num_files)
+                    kind.forget(out, store.id, begun.scene)
             elif not (is_folder(out.parent) and str(out) in begun.receipt["pending"].get("tiles", {})):
                 # Else a purge that was interrupted has cleaned it.
                 unreachable.append(f"{out}: it is not there, or nothing in it was written by gsmap")

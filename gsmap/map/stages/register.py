@@ -217,7 +217,7 @@ def _register_candidates(work: _RegistrationContext, known: RegisteredPairs) -> 
     asked, keys = store.indexes.lookup_states(), keys_of_lookups(work.described, params)
     new = sorted(scene for scene in work.described if asked.get(scene, ("", None))[0] != keys[scene])
     if new:
-        look_up_scenes(store, work.described, new, params, work.progress)
+        look_up_scenes(store, work.described, new, params, work.settings.index_recipes(), work.progress)
     ties = Counter(scene for pair in known.held.values() for scene in pair)
     # Scenes with untried candidates, and scenes that have lost edges since.
     short = {

@@ -28,10 +28,9 @@ from gsmap.geodesy.frame import from_frame
 from gsmap.geometry.boxes import robust_box
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.map.georeferenced_components import GeoreferencedComponent, world_notes
-from gsmap.map.objects.map_objects import MapObjects
 from gsmap.map.pictures.floor_plans import read_scene
 from gsmap.map.settings import Settings
-from gsmap.map.stages.export import ExportPlan, Request, make_content, plan
+from gsmap.map.stages.export import ExportPlan, FindOmitted, Request, make_content, plan
 from gsmap.report import PlanScene, make_plan
 from gsmap.report.plan import rings
 from gsmap.store import Store
@@ -76,7 +75,7 @@ def export_survey(
     options: SurveyOptions,
     settings: Settings,
     progress: Progress,
-    known: MapObjects | None = None,
+    find_omitted: FindOmitted | None = None,
 ) -> tuple[str, ...]:
     """Write one georeferenced component of the merged map as the kind of file that the suffix of ``out`` names.
 
@@ -96,7 +95,7 @@ def export_survey(
             code="option_not_applicable",
         )
     require_library(out)
-    planned = plan(store, replace(request, format="ply", up="z"), settings, known)
+    planned = plan(store, replace(request, format="ply", up="z"), settings, find_omitted)
     component, placed = _component(planned, request.component)
     planned = replace(planned, tiles=[tile for tile in planned.tiles if tile.component == component])
     parts = _parts(store, planned, settings, placed, progress)

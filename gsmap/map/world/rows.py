@@ -1,4 +1,4 @@
-"""Report the georeference of a map."""
+"""Report the georeference of a map as rows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from gsmap.map.reports.common import names
 from gsmap.map.snapshot_read import snapshot_read
 from gsmap.reason_codes import reason_code
 from gsmap.store import Store
-from gsmap.types import ScenePose
 from gsmap.types.plain import fields_of
 from gsmap.types.rows.world import ContradictionRow, GeoreferenceRow, ResidualRow, ResidualSummaryRow, WorldReport
 from gsmap.types.world import Contradiction, Georeference, Residual, Survey, WorldPose
@@ -112,31 +111,3 @@ def residual_row(row: Residual, name_of: Mapping[str, str]) -> ResidualRow:
 def _rms(errors: Sequence[tuple[float, ...]]) -> float | None:
     told = [float(np.sum(np.square(error))) for error in errors if error]
     return float(np.sqrt(np.mean(told))) if told else None
-
-
-def world_positions(
-    store: Store, poses: Mapping[str, ScenePose], crs_text: str | None = None
-) -> tuple[tuple[str, str] | None, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """Return the CRS with its height reference, and each scene's origin: metres in the world frame and
-
-    Args:
-        crs_text: another CRS than the map's.
-    """
-    ties = {tie.component: tie for tie in store.revisions.world() if tie.S_world_map is not None and tie.frame}
-    if not ties:
-        return None, {}
-    from gsmap.geodesy.crs import crs
-    from gsmap.geodesy.frame import from_frame
-
-    found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    named = None
-    for component, tie in ties.items():
-        assert tie.frame is not None
-        assert tie.S_world_map is not None
-        mine = [pose for pose in poses.values() if pose.component == component]
-        named = crs_text or tie.frame.crs
-        if mine:
-            metric = tie.S_world_map.apply(np.array([pose.S_map_scene.translation for pose in mine]))
-            world = from_frame(tie.frame, metric, named)
-            found |= {pose.scene: (metric[k], world[k]) for k, pose in enumerate(mine)}
-    return (None if named is None else (named, crs(named).heights)), found
