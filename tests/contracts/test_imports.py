@@ -58,6 +58,55 @@ LAYERS = [
 
 RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
 
+FEATURES: dict[str, set[str]] = {
+    "changes": {"change"},
+    "evaluation": {"evaluate"},
+    "find": {"find", "map.objects", "map.pictures", "map.thinning"},
+    "localization": {"localize", "map.objects"},
+    "objects": {"objects", "map.changes"},
+    "page": {"view", "report", "map.changes", "map.localization", "map.objects", "map.pictures", "map.report"},
+    "pictures": {"view", "report", "map.changes", "map.objects"},
+    "report": {"report", "map.changes", "map.objects", "map.pictures"},
+    "small_map": {"localize", "map.changes", "map.localization", "map.objects"},
+    "thinning": {"thin"},
+    "world": {"world", "report", "map.localization", "map.pictures"},
+}
+"""The features, folders of ``gsmap/map``, with the rooms of features and the other features that each may import."""
+
+OF_FEATURES = {f"map.{name}" for name in FEATURES}.union(*FEATURES.values())
+
+LAYERS_OF_MAP = [
+    {
+        "backups",
+        "catalog_trust",
+        "date_filter",
+        "georeferenced_components",
+        "map_operations",
+        "merged_tiles",
+        "metric_scales",
+        "models",
+        "outputs",
+        "progress_logging",
+        "scene_index",
+        "settings",
+        "shared_jobs",
+        "snapshot_read",
+        "undated_overlaps",
+    },
+    {"jobs", "rejected_changes", "reports", "scene_lookup"},
+    {"poses", "stages"},
+    {"pair_explanation", "status"},
+    set(FEATURES),
+    {"map"},
+    {"__init__"},
+]
+"""Modules and folders of ``gsmap/map`` from the bottom up, as `LAYERS`; those below the features are the core."""
+
+RANK_IN_MAP = {part: rank for rank, layer in enumerate(LAYERS_OF_MAP) for part in layer}
+
+ROOTS = {"__init__", "map", "settings"}
+"""The modules of ``gsmap/map`` that compose the core and its features."""
+
 NATIVE = "gsmap._native"
 
 HOMES = {
@@ -131,6 +180,12 @@ def room_of(module: str) -> str:
     return rest[0] if rest else "__init__"
 
 
+def part_of(module: str) -> str:
+    """The module or folder of ``gsmap/map`` that a module of this room lies in."""
+    parts = module.split(".")
+    return parts[2] if len(parts) > 2 else "__init__"
+
+
 def is_ours(module: str) -> bool:
     return module.split(".")[0] in SOURCES and module != NATIVE
 
@@ -155,6 +210,27 @@ def test_import_direction(module: str) -> None:
             assert below == room or RANK[below] < RANK[room], f"{module} must not import {other}"
         top = other.split(".")[0]
         assert top not in HOMES or room in HOMES[top], f"{top} has its home in {HOMES[top]}, not in {room}"
+
+
+@pytest.mark.parametrize("module", [one for one in OURS if room_of(one) == "map" and part_of(one) not in ROOTS])
+def test_imports_within_map(module: str) -> None:
+    """The core imports no feature and no room of one, a feature only those of its row, and no import runs upward."""
+    part = part_of(module)
+    for other in filter(is_ours, GRAPH.successors(module)):
+        name = f"map.{part_of(other)}" if room_of(other) == "map" else room_of(other)
+        if name == f"map.{part}":
+            continue
+        if name in OF_FEATURES:
+            assert name in FEATURES.get(part, ()), f"{module} must not import {other}"
+        elif name.startswith("map."):
+            assert RANK_IN_MAP[name[4:]] < RANK_IN_MAP[part], f"{module} must not import {other}"
+
+
+def test_features_import_each_other_one_way() -> None:
+    between = {(name, one[4:]) for name, allowed in FEATURES.items() for one in allowed if one.startswith("map.")}
+    assert nx.is_directed_acyclic_graph(nx.DiGraph(between))
+    used = {(part_of(a), part_of(b)) for a, b in GRAPH.edges if room_of(a) == room_of(b) == "map"}
+    assert between <= used, "remove what is not used"
 
 
 def test_only_the_demo_imports_synthetic_scenes() -> None:
