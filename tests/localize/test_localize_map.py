@@ -230,7 +230,7 @@ def test_a_photo_is_kept_once_and_follows_its_scene(copy) -> None:
         assert np.allclose(moved.T_map_camera[:3, :3], S.rotation @ row.T_map_camera[:3, :3])
         (drawn,) = view_of(m.store, m.settings).photos
         assert (drawn["file"], drawn["captured_at"]) == ("changed.jpg", kept.captured_at)
-        assert list(drawn["size"]) == [480, 360]
+        assert list(drawn["size_px"]) == [480, 360]
         assert np.allclose(drawn["T_map_camera"], moved.T_map_camera)
         with pytest.raises(NotFoundError):
             m.remove_photo("none.jpg")
