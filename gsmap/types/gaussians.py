@@ -167,13 +167,17 @@ class Gaussians:
             return cls.empty()
         parts = [part.about(parts[0].origin) for part in parts]
         k = max(p.sh.shape[1] for p in parts)
-        sh = [np.pad(p.sh, ((0, 0), (0, k - p.sh.shape[1]), (0, 0))) for p in parts]
+        sh = np.zeros((sum(len(p) for p in parts), k, 3), np.float32)
+        first = 0
+        for p in parts:
+            sh[first : first + len(p), : p.sh.shape[1]] = p.sh
+            first += len(p)
         return cls(
             np.concatenate([p.means for p in parts]),
             np.concatenate([p.quats for p in parts]),
             np.concatenate([p.log_scales for p in parts]),
             np.concatenate([p.logit_opacities for p in parts]),
-            np.concatenate(sh),
+            sh,
             parts[0].origin,
         )
 
