@@ -193,10 +193,7 @@ class _MapErrors:
             target_name=self.scenes[target].name,
             source=source,
             source_name=self.scenes[source].name,
-            rre_deg=error.rre_deg,
-            centroid_m=error.centroid_m / self.truth[target].scale,
-            rte=error.rte,
-            rse=error.rse,
+            **vars(error) | {"centroid_m": error.centroid_m / self.truth[target].scale},
         )
 
     def _edge(self, edge: EdgeRow) -> EdgeErrorRow:

@@ -2,33 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.geometry.rotations import angle_between
 from gsmap.geometry.umeyama import umeyama
 from gsmap.types import Gaussians, Sim3
-
-
-@dataclass(frozen=True)
-class PoseError:
-    """Errors of one estimated ``S_target_source``.
-
-    Args:
-        rre_deg: relative rotation error, the angle of ``R^T R_hat``.
-        rte: relative translation error as GaussReg defines it, ``|t/s - t_hat/s_hat| / |t/s|``; it depends on the
-            distance between the origins of both frames.
-        rse: relative scale error ``|s - s_hat| / s``.
-        centroid_m: distance between the source's centroid under the estimated and under the true pose, in the target's
-            unit; it does not depend on the origins of the frames.
-    """
-
-    rre_deg: float
-    rte: float
-    rse: float
-    centroid_m: float
+from gsmap.types.rows.evaluation import PoseError
 
 
 def scene_centroid(gaussians: Gaussians, min_opacity: float = 0.3) -> np.ndarray:

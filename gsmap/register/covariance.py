@@ -229,8 +229,7 @@ def condition(
         inverse, rigid = np.linalg.inv(hessian), np.linalg.inv(hessian[:6, :6])
         free_covariance = inverse @ errors_of_others @ inverse, rigid @ errors_of_others[:6, :6] @ rigid
     influence = np.concatenate([np.linalg.solve(hessian, pull), np.linalg.solve(hessian[:6, :6], pull[:6])])
-    seen = error_field.Blocks(blocks.jacobian, blocks.residual, blocks.positions, blocks.directions, blocks.counts)
-    errors = error_field.estimate_errors(seen, influence)
+    errors = error_field.estimate_errors(blocks, influence)
     if errors is None:
         return None
     colour_motion = find_colour_motion(target, source, pose, blocks.centroid, with_scale=True)
@@ -422,7 +421,7 @@ def point_to_plane_jacobian(pose: Sim3, points: np.ndarray, normals: np.ndarray)
 
 
 @dataclass(frozen=True, eq=False)
-class PairBlocks:
+class PairBlocks(error_field.Blocks):
     """Weighted means of the pairs under a pose, over B blocks.
 
     Derivatives are about ``centroid``: rotation and translation then hardly mix, and the matrices are well scaled.
@@ -434,11 +433,6 @@ class PairBlocks:
         radius_m: radius of the overlap.
     """
 
-    jacobian: np.ndarray
-    residual: np.ndarray
-    positions: np.ndarray
-    directions: np.ndarray
-    counts: np.ndarray
     weights: np.ndarray
     hessian: np.ndarray
     points: np.ndarray

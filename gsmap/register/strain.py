@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -170,8 +170,7 @@ def _covariance(blocks: PairBlocks, J: np.ndarray) -> np.ndarray | None:
     """Return the (5, 5) covariance of a strain by the Jacobian (B, 12); None where there are too few blocks."""
     pull = (J * blocks.weights[:, None]).T
     influence = np.linalg.pinv(pull @ J, hermitian=True) @ pull
-    seen = error_field.Blocks(J, blocks.residual, blocks.positions, blocks.directions, blocks.counts)
-    errors = error_field.estimate_errors(seen, influence)
+    errors = error_field.estimate_errors(replace(blocks, jacobian=J), influence)
     return None if errors is None else errors.covariance[7:, 7:]
 
 

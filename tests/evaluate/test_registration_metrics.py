@@ -48,7 +48,7 @@ def test_small_angles_keep_their_digits():
 
 
 def test_summary_counts_missing_pairs_as_missed():
-    errors = [PoseError(0.1, 0.01, 0.0, 0.01), PoseError(90.0, 1.0, 0.5, 3.0), None, PoseError(3.0, 0.05, 0.0, 0.2)]
+    errors = [PoseError(0.1, 0.01, 0.01, 0.0), PoseError(90.0, 3.0, 1.0, 0.5), None, PoseError(3.0, 0.2, 0.05, 0.0)]
     summary = summarise(errors)
     assert (summary.num_pairs, summary.num_estimated) == (4, 3)
     assert summary.mean_rre_deg == pytest.approx(93.1 / 3)

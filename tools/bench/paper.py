@@ -36,7 +36,7 @@ import argparse
 import json
 import tempfile
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -250,9 +250,7 @@ def measured(name: str, captures: list[Capture], run, settings: Settings, descri
                 for stage in ("posed", "refined"):
                     pose = getattr(out, stage)
                     error = pose and pose_error(pose, truth, centre)
-                    out.errors[stage] = error and PoseError(
-                        error.rre_deg, error.rte, error.rse, error.centroid_m / a.S_scene_world.scale
-                    )
+                    out.errors[stage] = error and replace(error, centroid_m=error.centroid_m / a.S_scene_world.scale)
             found[a.place, a.name, b.name] = out
             if overlap >= OVERLAPPING:
                 wanted.append(out)

@@ -10,17 +10,28 @@ from gsmap.types.rows.base import Row
 from gsmap.types.rows.pairs import PairRef
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PoseErrorRow(PairRef):
-    """The error of one estimated relative pose.
+@dataclass(frozen=True, eq=False)
+class PoseError:
+    """Errors of one estimated ``S_target_source``.
 
     Args:
-        rre_deg: relative rotation error.
+        rre_deg: relative rotation error, the angle of ``R^T R_hat``.
         centroid_m: distance between the estimated and true position of the source's centre, in metres by the truth's
-            scale.
-        rte: relative translation error divided by the true length, as in GaussReg.
-        rse: relative scale error.
+            scale; it does not depend on the origins of the frames.
+        rte: relative translation error as in GaussReg, ``|t/s - t_hat/s_hat| / |t/s|``; it depends on the distance
+            between the origins of both frames.
+        rse: relative scale error, ``|s - s_hat| / s``.
     """
+
+    rre_deg: float
+    centroid_m: float
+    rte: float
+    rse: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PoseErrorRow(PoseError, PairRef):
+    """The error of one estimated relative pose."""
 
     columns: ClassVar[Mapping[str, str]] = {
         "pair": "pair",
@@ -29,11 +40,6 @@ class PoseErrorRow(PairRef):
         "rte": "RTE",
         "rse": "RSE",
     }
-
-    rre_deg: float
-    centroid_m: float
-    rte: float
-    rse: float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
