@@ -190,6 +190,12 @@ def is_ours(module: str) -> bool:
     return module.split(".")[0] in SOURCES and module != NATIVE
 
 
+def test_one_module_escapes_text_for_html() -> None:
+    assert [name for name in OURS if room_of(name) != "gsmap_synthetic" and GRAPH.has_edge(name, "html")] == [
+        "gsmap.markup"
+    ]
+
+
 def test_no_import_runs_in_a_circle() -> None:
     ours = GRAPH.subgraph(OURS)
     circles = [sorted(part) for part in nx.strongly_connected_components(ours) if len(part) > 1]
