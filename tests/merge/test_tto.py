@@ -293,20 +293,3 @@ def test_where_both_are_preferred_dates_decide_nothing():
 def test_settings_that_make_no_sense_are_refused_by_name(wrong):
     with raises(ConfigError, code="out_of_range", match=next(iter(wrong))):
         Params(**wrong)
-
-
-@pytest.mark.parametrize(
-    ("params", "rendered"),
-    [(Params(), 360), (Params(steps=0), 150), (Params(steps=200), 200), (Params(steps=200, max_views=9), 9)],
-)
-def test_a_fit_of_few_steps_renders_few_views(monkeypatch, params, rendered):
-    asked = []
-    render_references = tto.render_references
-
-    def counted(*arguments, max_views, **more):
-        asked.append(max_views)
-        return render_references(*arguments, max_views=2, **more)
-
-    monkeypatch.setattr(tto, "render_references", counted)
-    merge(two_scenes(), "tto", params)
-    assert asked == [rendered]

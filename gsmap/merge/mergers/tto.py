@@ -31,7 +31,7 @@ from gsmap.settings.ranges import require_range
 from gsmap.types import Gaussians, MergeResult, PosedScene
 from gsmap.types.progress import Progress
 
-VERSION = 12
+VERSION = 11
 """Version, raised whenever the result for the same scenes changes, also through modules of `gsmap.merge` that it
 calls."""
 STEPS: str | None = "steps"
@@ -45,7 +45,6 @@ _LAST = 0.1  # last step relative to the first; the decay is exponential
 _OWNER_CELL_M = 0.5  # edge of the owner cells
 _COVER_M = 0.1  # a Gaussian of the owner within this distance replaces one of another scene
 _SEED = 0  # random seed of the order of views
-_MIN_VIEWS = 150  # with few steps: views that are still rendered, which tell what is visible
 _MIN_PASS_STEPS = 20  # smallest number of steps of a pass over all views, for a tile that few pixels show
 _SURE_FRACTION = 0.5  # share of the steps that are always taken, because long initial steps may raise the loss
 _MIN_GAIN = 0.002  # if a pass decreases the loss by a smaller fraction, the fit stops
@@ -157,9 +156,6 @@ def merge(
         scenes, log_gains = balance_exposure(scenes)
         if log_gains.any():
             notes.append(f"exposures differed by up to {np.ptp(log_gains, axis=0).max() / np.log(2):.2f} stops")
-    max_views = params.max_views
-    if params.steps is not None:  # a step uses one view
-        max_views = min(max_views, max(params.steps, _MIN_VIEWS))
     wanted = render_references(
         scenes,
         bounds,
@@ -167,7 +163,7 @@ def merge(
         params.longest_side_px,
         settled,
         lambda fraction, text: progress(0.2 * fraction, text),
-        max_views=max_views,
+        max_views=params.max_views,
         photo_weight=params.photo_weight,
     )
     # A single scene has no overlaps and already reproduces its own views.
