@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,11 @@ import gsmap
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geodesy.frame import from_frame, to_frame
 from gsmap.map.world.georeference import Request
+from gsmap.types import Gaussians
 from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "world"))
+import made_sites
 from made_sites import made_map, write_gcps
 from raising import raises
 
@@ -134,6 +137,34 @@ def test_a_floor_plan_has_footprints_in_longitude_and_latitude(tied: Path, site:
         middle = S.apply(np.zeros((1, 3)))[0, :2]
         assert (local.min(0) < middle + 3).all()
         assert (local.max(0) > middle - 3).all()
+
+
+def test_a_footprint_holds_sparse_ground_between_dense_posts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """10 m by 10 m of ground with few Gaussians, and posts with many at its corners, as plants have."""
+    bare = made_sites.ground
+
+    def with_posts(unit_m: float) -> Gaussians:
+        base, rng = bare(unit_m), np.random.default_rng(0)
+        corners = np.array([[x, y, 0.5] for x in (-4.7, 4.7) for y in (-4.7, 4.7)])
+        points = np.repeat(corners, 5000, axis=0) + rng.uniform(-0.3, 0.3, (20_000, 3))
+        rows = np.zeros(len(points), np.int64)
+        posts = replace(base[rows], means=(points / unit_m).astype(np.float32))
+        return Gaussians.concatenate([base, posts])
+
+    monkeypatch.setattr(made_sites, "ground", with_posts)
+    site = surveyed_site(1, SiteParams(rows=2, columns=2, num_check=0, survey_m=0.002))
+    with made_map(tmp_path / "site.gsmap", site) as m:
+        m.georeference(Request(gcp=write_gcps(tmp_path / "gcp.txt", site)))
+        m.export_survey(tmp_path / "plan.geojson", merge="union")
+    content = json.loads((tmp_path / "plan.geojson").read_text())
+    footprints = [f for f in content["features"] if f["properties"]["kind"] == "footprint"]
+    assert len(footprints) == 4
+    for one in footprints:
+        area = 0.0
+        for (ring,) in one["geometry"]["coordinates"]:
+            local = to_frame(site.frame, np.c_[ring, np.full(len(ring), site.frame.height_m)], "EPSG:4979")[:, :2]
+            area += 0.5 * (local[:-1, 0] * local[1:, 1] - local[1:, 0] * local[:-1, 1]).sum()
+        assert area > 85
 
 
 def test_a_drawing_has_the_floor_plan_in_the_crs(tied: Path, site: Site, tmp_path: Path) -> None:

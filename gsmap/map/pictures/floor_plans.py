@@ -33,8 +33,11 @@ class SceneArrays:
     gaussians: Gaussians | None = None
 
 
-def read_scene(store: Store, scene: SceneFacts, *, whole: bool) -> SceneArrays:
+def read_scene(store: Store, scene: SceneFacts, *, whole: bool, most: int = _SAMPLE) -> SceneArrays:
     """Read a scene: its Gaussians, or the landmarks of its graph.
+
+    Args:
+        most: number of points to sample; fewer leave out surfaces that have few of the Gaussians.
 
     Raises:
         CorruptError, NotFoundError: its arrays cannot be read.
@@ -48,11 +51,11 @@ def read_scene(store: Store, scene: SceneFacts, *, whole: bool) -> SceneArrays:
         gaussians, kind = store.scenes.unread(scene.id).degree_0(), "rendered"
         solid = np.flatnonzero((gaussians.opacities > _SOLID) & np.isfinite(gaussians.means).all(1))
         if len(solid):
-            points = gaussians.means[solid[:: -(-len(solid) // _SAMPLE)]].astype(np.float64)
+            points = gaussians.means[solid[:: -(-len(solid) // most)]].astype(np.float64)
     elif (graph := store.graphs.load(scene.id)) is not None:
         layer = graph.layers.get("landmarks") or graph.layers.get("landmarks:1") or graph.layers.get("objects")
         if layer is not None and len(layer):
-            points, kind = layer.positions[:: -(-len(layer) // _SAMPLE)], "landmarks"
+            points, kind = layer.positions[:: -(-len(layer) // most)], "landmarks"
     middle = np.median(eyes if len(eyes) else points, axis=0)
     return SceneArrays(points, track, eyes, middle, kind, gaussians)
 

@@ -47,6 +47,7 @@ KINDS = {
 
 _SOLID = 0.3  # opacity from which a Gaussian is a point of the surface
 _LONGEST_PX, _MOST_PX = 8192, 200_000_000
+_FOOTPRINT_POINTS = 1_000_000  # sampled of a scene
 _ABOVE_EYES = 0.3  # height shown above the cameras, as a fraction of their height above the floor
 _WALL_BAND = (0.4, 0.9)  # of the height of the cameras above the floor, at which walls are cut
 _EYES_M = 1.6  # height of cameras above the floor where a map has none
@@ -278,7 +279,7 @@ def _footprints(
     poses = {scene: S for tile in planned.tiles for scene, S in tile.poses.items()}
     for scene, S in sorted(poses.items(), key=lambda one: planned.scenes[one[0]].name):
         about = planned.scenes[scene]
-        points = placed.S_world_map.apply(S.apply(read_scene(store, about, whole=True).points))
+        points = placed.S_world_map.apply(S.apply(read_scene(store, about, whole=True, most=_FOOTPRINT_POINTS).points))
         drawn = make_plan([PlanScene(about.name, "placed", points, np.zeros((0, 3)), points.mean(0))], [], None)
         if drawn is None:
             continue
