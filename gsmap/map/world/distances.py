@@ -164,13 +164,18 @@ def _apart(a: np.ndarray | None, b: np.ndarray | None) -> float:
     return float(np.linalg.norm(a - b))
 
 
-def _direction(to: np.ndarray | None, of: np.ndarray | None) -> np.ndarray:
-    """Return the unit vector (3,) from one point to another; zeros if the points coincide."""
+def _variance_along(to: np.ndarray | None, of: np.ndarray | None, covariance: np.ndarray) -> float:
+    """Return the variance of the distance between two points from the covariance (3, 3) of their difference.
+
+    Points nearer to each other than their uncertainty have no known direction: theirs is that of the largest variance.
+    """
     assert to is not None
     assert of is not None
+    if not np.isfinite(covariance).all():
+        return float("inf")
     span = to - of
-    out: np.ndarray = span / max(float(np.linalg.norm(span)), 1e-300)
-    return out
+    square, largest = float(span @ span), max(0.0, float(np.linalg.eigvalsh(covariance)[-1]))
+    return largest if square <= largest else float(span @ covariance @ span) / square
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,30 +199,30 @@ class _PoseUncertainty:
 def _pose_variance(solved: _PoseUncertainty, placed: list[_LocatedPoint]) -> float:
     """Return the variance of the distance in the map frame from poses and picking."""
     one, two = placed
-    along = _direction(one.map, two.map)
-    variance = 0.0
+    covariance = np.zeros((3, 3))
     for end in placed:
         turn = _turn(solved.graph, end)
-        variance += float(along @ turn @ end.place.covariance @ turn.T @ along)
-    if one.place.scene == two.place.scene:
-        return variance  # both move with it
-    moved = [(end, sign) for end, sign in zip(placed, (1.0, -1.0), strict=True) if end.place.scene is not None]
-    joint = solved.joint(one.component, [str(end.place.scene) for end, _ in moved])
-    if joint is None:
-        return float("inf")
-    J = np.zeros(joint.shape[0])
-    for k, (end, sign) in enumerate(moved):
-        J[7 + 7 * k : 14 + 7 * k] = sign * along @ _turn(solved.graph, end) @ point_jacobian(end.place.point)
-    return variance + float(J @ joint @ J)
+        covariance += turn @ end.place.covariance @ turn.T
+    if one.place.scene != two.place.scene:  # else both move with it
+        moved = [(end, sign) for end, sign in zip(placed, (1.0, -1.0), strict=True) if end.place.scene is not None]
+        joint = solved.joint(one.component, [str(end.place.scene) for end, _ in moved])
+        if joint is None:
+            return float("inf")
+        J = np.zeros((3, joint.shape[0]))
+        for k, (end, sign) in enumerate(moved):
+            J[:, 7 + 7 * k : 14 + 7 * k] = sign * _turn(solved.graph, end) @ point_jacobian(end.place.point)
+        covariance += J @ joint @ J.T
+    return _variance_along(one.map, two.map, covariance)
 
 
 def _world_variance(solved: _PoseUncertainty, placed: list[_LocatedPoint]) -> float:
     """Return the variance of the distance between points of different components or of the world, whose errors are
     independent."""
     one, two = placed
-    along = _direction(one.metric, two.metric)
     covariances = [_world_covariance(solved, end) for end in placed]
-    return sum(float("inf") if found is None else float(along @ found @ along) for found in covariances)
+    if any(found is None for found in covariances):
+        return float("inf")
+    return _variance_along(one.metric, two.metric, sum((c for c in covariances if c is not None), np.zeros((3, 3))))
 
 
 def _world_covariance(solved: _PoseUncertainty, end: _LocatedPoint) -> np.ndarray | None:
