@@ -419,7 +419,7 @@ class Transfer:
                 self.counts["observations"] += 1
             elif row.removed_at is not None and known.removed_at is None:
                 self._take_back(observations, known.number, row.removed_at)
-        self._keep_latest(observations, lambda row: (row.kind, row.name, row.scene))
+        self._keep_latest(observations, lambda row: (row.kind, row.name, row.scene, row.other))
 
     def _take_back(self, table: Table, number: int, removed_at: str) -> None:
         self.ours.execute(update(table).where(table.c.number == number).values(removed_at=removed_at))

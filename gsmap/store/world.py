@@ -66,7 +66,7 @@ class WorldObservations:
         with self._catalog.read() as connection:
             living = living_ids(connection)
             rows = [row for row in connection.execute(_current_rows()) if _has_living_scenes(row, living)]
-        items: dict[tuple[str, str, str], Any] = {_key(row): _item(row) for row in rows}
+        items: dict[tuple[str, str, str, str], Any] = {_key(row): _item(row) for row in rows}
         items |= {_key_of(_row(item)): item for item in coming}
         by_kind: dict[str, list[Any]] = {kind: [] for kind in _TYPES}
         for key in sorted(items):
@@ -140,13 +140,12 @@ def _has_living_scenes(row: Row[Any], living: set[str]) -> bool:
     return all(scene is None or scene in living for scene in (row.scene, row.other))
 
 
-def _key(row: Row[Any]) -> tuple[str, str, str]:
-    return row.kind, row.name, row.scene or ""
+def _key(row: Row[Any]) -> tuple[str, str, str, str]:
+    return row.kind, row.name, row.scene or "", row.other or ""
 
 
-def _key_of(row: Mapping[str, Any]) -> tuple[str, str, str]:
-    # A scale bar is identified by its name alone: it may be measured again in other scenes.
-    return row["kind"], row["name"], row["scene"] or ""
+def _key_of(row: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    return row["kind"], row["name"], row["scene"] or "", row["other"] or ""
 
 
 def _row(item: Observation) -> dict[str, Any]:

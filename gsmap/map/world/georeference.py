@@ -94,7 +94,7 @@ def georeference(
     if request.exif is not None:
         _read_exif(store, Path(request.exif), settings, before, noted)
     for one in request.bars:
-        noted.items.append(_bar(store, *one, request.bar_sigma_m))
+        noted.items.append(_bar(store, *one, request.bar_sigma_m, before))
     if request.check is not None:
         _hold_out(before, set(request.check), noted)
     places = [one for one in noted.items if isinstance(one, (ControlPoint, PositionFix))]
@@ -436,7 +436,8 @@ def _refuse_other_days(store: Store, photos: Sequence[tuple[str, PositionFix]]) 
                 )
 
 
-def _bar(store: Store, a: str, b: str, metres: float, sigma_m: float | None) -> ScaleBar:
+def _bar(store: Store, a: str, b: str, metres: float, sigma_m: float | None, before: Survey) -> ScaleBar:
+    """Return a scale bar, under the name of the bar between the same points if there is one: scenes are renamed."""
     if not (np.isfinite(metres) and metres > 0):
         raise ConfigError(
             f"the length of a scale bar must be a positive number of metres, got {metres:g}", code="invalid_observation"
@@ -450,7 +451,8 @@ def _bar(store: Store, a: str, b: str, metres: float, sigma_m: float | None) -> 
     ]
     points = np.stack([end.point for end in ends])
     sigma = sigma_m or BAR_SIGMA_FRACTION * metres
-    return ScaleBar(f"{a} to {b}", scenes, points, (sigmas[0], sigmas[1]), metres, sigma)
+    same = (bar.name for bar in before.bars if bar.scenes == scenes and np.array_equal(bar.points, points))
+    return ScaleBar(next(same, f"{a} to {b}"), scenes, points, (sigmas[0], sigmas[1]), metres, sigma)
 
 
 def take_back(store: Store, names: Iterable[str]) -> int:
