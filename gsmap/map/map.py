@@ -170,8 +170,9 @@ class Map(AbstractContextManager["Map"]):
         return iter(self.scenes())
 
     def __contains__(self, ref: object) -> bool:
-        """Return whether a living scene has this name or id."""
-        return any(ref in (scene.name, scene.id) for scene in self.scenes())
+        """Return whether a living scene has this name or id, or is this `Scene`."""
+        wanted = ref.id if isinstance(ref, Scene) else ref
+        return any(wanted in (scene.name, scene.id) for scene in self.scenes())
 
     def __getitem__(self, ref: str) -> Scene:
         """Return a living scene by name, id or the beginning of its id.
@@ -1278,7 +1279,7 @@ class Map(AbstractContextManager["Map"]):
         """Edit a scene's name, date, notes and tags (``gsmap edit MAP SCENE``); its history keeps earlier values.
 
         Args:
-            tags, untag: tags to add and to remove.
+            tags, untag: tags to add and to remove, or one tag.
             author: author of the edit.
             edits: new ``name``, ``captured_at`` (``none`` removes the date), ``note`` or ``metres_per_unit`` (of the
                 scene's own frame; 0 removes it).
@@ -1287,7 +1288,8 @@ class Map(AbstractContextManager["Map"]):
 
         if (date := edits.get("captured_at")) is not None:
             edits["captured_at"] = "" if date.strip().lower() == "none" else given_date(date).when
-        scene = self.store.scenes.edit(ref, tags_add=tuple(tags), tags_remove=tuple(untag), author=author, **edits)
+        added, removed = ((one,) if isinstance(one, str) else tuple(one) for one in (tags, untag))
+        scene = self.store.scenes.edit(ref, tags_add=added, tags_remove=removed, author=author, **edits)
         return reports.scene_row(self.store, scene, self.metres())
 
     def photo_rows(self) -> list[PhotoRow]:

@@ -136,7 +136,7 @@ class Revisions:
             NotFoundError: no such revision, or `prune` dropped it.
         """
         with self._catalog.read() as connection:
-            wanted = _newest(connection) if number is None else number
+            wanted = _newest(connection) if number is None else int(number)  # SQLite finds no NumPy integer
             if wanted is None:
                 return None
             row = connection.execute(select(revisions).where(revisions.c.number == wanted)).first()
@@ -164,7 +164,7 @@ class Revisions:
             NotFoundError: no such revision.
         """
         with self._catalog.read() as connection:
-            row = connection.execute(select(revisions).where(revisions.c.number == number)).first()
+            row = connection.execute(select(revisions).where(revisions.c.number == int(number))).first()
         if row is None:
             raise NotFoundError(
                 f"the map has no revision {number}: gsmap list MAP revisions shows the revisions",

@@ -112,6 +112,7 @@ def test_places_are_told_by_object_by_point_and_by_box(site: Map) -> None:
     assert [row.id for row in site.history(table.id).objects] == [table.id]
     everything = site.history(box=[-1, -1, -1, 5, 5, 3])
     assert len(everything.objects) == len(site.objects().objects) == 3
+    assert site.history(box=np.array([[-1, -1, -1], [5, 5, 3]])) == everything
     nothing = site.history("2,1.5,1.5")
     assert nothing.objects == ()
     assert "no object was ever found" in nothing.notes[-1]

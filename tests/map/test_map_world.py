@@ -126,6 +126,41 @@ def test_a_rough_scale_bar_does_not_outweigh_a_length_that_was_specified(site: S
         assert (found.distance_m, found.known_by) == (pytest.approx(2.0, rel=0.01), "told")
 
 
+def test_points_that_coincide_are_no_better_known_than_their_scenes(tied: Path, site: Site) -> None:
+    """The origin of a scene, picked in a neighbour, too: the distance is 0, and its error that of the two poses."""
+    with gsmap.map.open(tied) as m:
+        poses = m.poses()
+        S = poses["site-008"].S_map_scene.inverse() @ poses["site-000"].S_map_scene
+        same = m.measure("site-000:0,0,0", "site-008:" + ",".join(map(repr, S.translation.tolist())))
+        far = m.measure("site-000:0,0,0", "site-008:0,0,0")
+        world = m.measure("site-000:0,0,0", f"world:{','.join(map(repr, same.a.world.tolist()))}")
+    assert max(same.distance_m, world.distance_m) < 1e-6
+    assert same.sigma_m > 0.3 * far.sigma_m
+    assert np.max(same.a.sigma_m) <= world.sigma_m <= np.linalg.norm(same.a.sigma_m)
+
+
+def test_one_tag_is_a_text_and_a_scene_is_in_its_map(site: Site, tmp_path: Path) -> None:
+    with made_map(tmp_path / "site.gsmap", site) as m:
+        assert m.edit("site-000", tags="hall").tags == ("hall",)
+        assert m.edit("site-000", untag="hall").tags == ()
+        assert all(scene in m for scene in m)
+        removed = m["site-001"]
+        m.remove("site-001")
+        assert removed not in m
+        assert m.thin(keep_days=np.int64(3650), dry_run=True, now="2026-01-01").scenes == ()
+
+
+def test_a_bar_is_measured_again_where_scenes_were_renamed(site: Site, tmp_path: Path) -> None:
+    with made_map(tmp_path / "site.gsmap", site) as m:
+        m.georeference(Request(bars=[("site-000:0,0,0", "site-001:0,0,0", 10.0)]))
+        m.edit("site-001", name="yard")
+        m.georeference(Request(bars=[("site-000:0,0,0", "yard:0,0,0", 11.0)]))
+        assert [bar.length_m for bar in m.store.world.survey().bars] == [11.0]
+        m.edit("site-002", name="site-001")  # the bar of another pair of scenes, in the words of the first
+        m.georeference(Request(bars=[("site-000:0,0,0", "site-001:0,0,0", 12.0)]))
+        assert sorted(bar.length_m for bar in m.store.world.survey().bars) == [11.0, 12.0]
+
+
 def test_observations_live_through_branch_backup_clone_and_merge(tied: Path, site: Site, tmp_path: Path) -> None:
     before = world_of(tied)
     with gsmap.map.open(tied) as m:

@@ -419,3 +419,11 @@ def test_what_is_remembered_of_pairs_is_what_is_read_anew(store):
         assert dict(store.registrations.current_keys()) == {
             one.pair: "" if one.is_specified else one.key for one in store.registrations.all_summaries()
         }
+
+
+def test_a_revision_is_found_by_an_integer_of_numpy(store):
+    """As a table of revisions in pandas has."""
+    scene = store.scenes.list()[0].id
+    number = np.int64(store.revisions.save(PoseGraph({scene: ScenePose(scene, Sim3.identity(), 0, "placed")})))
+    assert set(store.revisions.get(number).poses) == {scene}
+    assert store.revisions.entry(number).number == number

@@ -402,7 +402,7 @@ def _area(place: str | None, box: Sequence[float] | None) -> np.ndarray:
     """Return the corners (2, 3) of a point or a box."""
     try:
         numbers = (
-            [float(part) for part in place.split(",")] if place is not None else [float(part) for part in box or ()]
+            [float(part) for part in place.split(",")] if place is not None else np.ravel(np.array(box, float)).tolist()
         )
     except ValueError as error:
         raise ConfigError(

@@ -66,7 +66,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
     dated = sorted((s for s in living.values() if s.captured_at is not None), key=_when)
     try:
         now = _present(store, dated) if request.now is None else _moment(request.now)
-        before = now - timedelta(days=request.keep_days or 0)
+        before = now - timedelta(days=float(request.keep_days or 0))
     except OverflowError as error:
         raise ConfigError(
             f"no date lies {request.keep_days:g} days before today: pass fewer days", code="date_out_of_range"
