@@ -4,47 +4,57 @@
 
 namespace GSMAP_ISA {
 
-constexpr int kGroup = W == 16 ? kVectors : 4;  // vectors whose state fits the registers
+// Vectors that are blended together: as many as fit the registers. Wide ones are blended one by one, each with a list of
+// its own (a strip), because small Gaussians reach few of them, and branches cannot predict which.
+constexpr int kGroup = W == 16 ? 1 : 4;
+constexpr int kStrips = W == 16 ? kVectors : 1, kListed = W == 16 ? 128 : kRound;
+static_assert(kStrips == 1 || (kStrips == 4 && kColumns == 1), "blend_block has one call for each strip");
+using BlendRound = RoundOf<kListed, kStrips>;
 
-// The pixels of one block: transmittance, what is blended so far, the largest weight and whose it was.
+// The pixels of one block: transmittance, what is blended so far, the largest weight and whose it was. A pixel stops
+// before its transmittance falls to 1e-4: `left` falls on, so that the next Gaussian need not wait for what was decided.
 struct alignas(64) BlendBlock {
-    float t[kPixels], r[kPixels], g[kPixels], b[kPixels], depth[kPixels], best[kPixels];
+    float left[kPixels], t[kPixels], r[kPixels], g[kPixels], b[kPixels], depth[kPixels], best[kPixels];
     int32_t id[kPixels];
-    M alive[kVectors];
+    INLINE bool is_open() const {
+        M any_left{};
+        for (int k = 0; k < kVectors; k++) any_left = either(any_left, gt(load(&left[k * W]), set1(kMinTransmittance)));
+        return any(any_left);
+    }
 };
 
-template <bool kDepth, bool kId, bool kWeight>
-INLINE void blend_group(const Round &round, BlendBlock &s, const Lanes &lanes, int b, int column, int row,
-                        float *max_weight) {
+// Blends what is listed for a block, or for strip kStrip of it, into the vectors of a group that begins with `row`.
+template <bool kDepth, bool kId, bool kWeight, int kStrip>
+INLINE void blend_group(const BlendRound &round, BlendBlock &s, const Lanes &lanes, int b, int column, int row, V *most) {
     const uint32_t *ids = (const uint32_t *)round.field[ID];
-    const Lanes first = lanes.in_tile(b, row);
-    V t[kGroup], r[kGroup], g[kGroup], bl[kGroup], d[kGroup], best[kGroup];
+    const Lanes first = lanes.in_tile(b, kStrips > 1 ? 0 : row);
+    V left[kGroup], t[kGroup], r[kGroup], g[kGroup], bl[kGroup], d[kGroup], best[kGroup];
     I id[kGroup];
-    M alive[kGroup];
     int at[kGroup];
     for (int v = 0; v < kGroup; v++) {
         const int k = (row + v) * kColumns + column;
         at[v] = k;
-        t[v] = load(&s.t[k * W]), r[v] = load(&s.r[k * W]), g[v] = load(&s.g[k * W]);
-        bl[v] = load(&s.b[k * W]), alive[v] = s.alive[k];
+        left[v] = load(&s.left[k * W]), t[v] = load(&s.t[k * W]);
+        r[v] = load(&s.r[k * W]), g[v] = load(&s.g[k * W]), bl[v] = load(&s.b[k * W]);
         if (kDepth) d[v] = load(&s.depth[k * W]);
         if (kId) best[v] = load(&s.best[k * W]), id[v] = *(const I *)&s.id[k * W];
     }
-    for (int i = 0; i < round.listed[b]; i++) {
-        const int j = round.list[b][i];
+    const int listed = b * kStrips + kStrip;
+    for (int i = 0; i < round.listed[listed]; i++) {
+        const int j = round.list[listed][i];
         Splat splat(round, first, j);
+        for (int v = 0; v < kStrip; v++) splat.next_row();
         const V cr = set1(round.field[R][j]), cg = set1(round.field[G][j]), cb = set1(round.field[B][j]);
         const V depth = kDepth ? set1(round.field[DEPTH][j]) : V{};
-        V most{};
         for (int v = 0; v < kGroup; v++) {
             const V exponent = splat.exponent(splat.u_at(column));
             splat.next_row();
-            const M touched = both(ge(exponent, set1(kMinLog2Alpha)), alive[v]);
-            if (!any(touched)) continue;
+            const M touched = ge(exponent, set1(kMinLog2Alpha));
+            if (kStrips == 1 && !any(gt(touched, left[v], set1(kMinTransmittance)))) continue;
             const V alpha = min(exp2_in_range(exponent), set1(kMaxAlpha));
-            const V weight = alpha * t[v], rest = fnma(alpha, t[v], t[v]);
+            const V weight = alpha * left[v], rest = fnma(alpha, left[v], left[v]);
             const M drawn = gt(touched, rest, set1(kMinTransmittance));
-            alive[v] = first_not_second(alive[v], differ(touched, drawn));  // who would fall to 1e-4 stops before
+            left[v] = select(touched, rest, left[v]);
             r[v] = fma_where(drawn, weight, cr, r[v]);
             g[v] = fma_where(drawn, weight, cg, g[v]);
             bl[v] = fma_where(drawn, weight, cb, bl[v]);
@@ -55,33 +65,54 @@ INLINE void blend_group(const Round &round, BlendBlock &s, const Lanes &lanes, i
                 best[v] = select(more, weight, best[v]);
                 id[v] = (I)select(more, (V)(I{} + int32_t(ids[j])), (V)id[v]);
             }
-            if (kWeight) most = max(most, zero_unless(drawn, weight));
-        }
-        if (kWeight) {
-            const float largest = max_of_lanes(most);
-            if (largest > 0.f) {  // positive floats order as integers; raising a maximum does not depend on the order
-                int32_t *cell = (int32_t *)max_weight + ids[j], mine, seen = __atomic_load_n(cell, __ATOMIC_RELAXED);
-                __builtin_memcpy(&mine, &largest, 4);
-                while (seen < mine && !__atomic_compare_exchange_n(cell, &seen, mine, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
-                }
-            }
+            if (kWeight) most[j] = max(most[j], zero_unless(drawn, weight));
         }
     }
     for (int v = 0; v < kGroup; v++) {
         const int k = at[v];
-        store(&s.t[k * W], t[v]), store(&s.r[k * W], r[v]), store(&s.g[k * W], g[v]);
-        store(&s.b[k * W], bl[v]), s.alive[k] = alive[v];
+        store(&s.left[k * W], left[v]), store(&s.t[k * W], t[v]);
+        store(&s.r[k * W], r[v]), store(&s.g[k * W], g[v]), store(&s.b[k * W], bl[v]);
         if (kDepth) store(&s.depth[k * W], d[v]);
         if (kId) store(&s.best[k * W], best[v]), *(I *)&s.id[k * W] = id[v];
     }
 }
 
-// All of one block's vectors.
+// All of one block's vectors; returns how many pairs of a Gaussian and a pixel were looked at.
 template <bool kDepth, bool kId, bool kWeight>
-INLINE void blend_block(const Round &round, BlendBlock &s, const Lanes &lanes, int b, float *max_weight) {
-    for (int row = 0; row < kBlockY / kRows; row += kGroup)
-        for (int column = 0; column < kColumns; column++)
-            blend_group<kDepth, kId, kWeight>(round, s, lanes, b, column, row, max_weight);
+INLINE int64_t blend_block(const BlendRound &round, BlendBlock &s, const Lanes &lanes, int b, V *most) {
+    if constexpr (kStrips > 1) {
+        blend_group<kDepth, kId, kWeight, 0>(round, s, lanes, b, 0, 0, most);
+        blend_group<kDepth, kId, kWeight, 1>(round, s, lanes, b, 0, 1, most);
+        blend_group<kDepth, kId, kWeight, 2>(round, s, lanes, b, 0, 2, most);
+        blend_group<kDepth, kId, kWeight, 3>(round, s, lanes, b, 0, 3, most);
+    } else {
+        for (int row = 0; row < kBlockY / kRows; row += kGroup)
+            for (int column = 0; column < kColumns; column++)
+                blend_group<kDepth, kId, kWeight, 0>(round, s, lanes, b, column, row, most);
+    }
+    int64_t pairs = 0;
+    for (int k = 0; k < kStrips; k++) pairs += round.listed[b * kStrips + k] * int64_t(kPixels / kStrips);
+    return pairs;
+}
+
+// Raises the largest weight of each Gaussian of a round to the largest over the lanes of `most`, which is cleared.
+INLINE void raise_weights(const BlendRound &round, V *most, float *max_weight) {
+    const uint32_t *ids = (const uint32_t *)round.field[ID];
+    for (int i = 0; i < round.count; i += W) {
+        transpose(most + i);
+        V largest = most[i];
+        for (int l = 1; l < W; l++) largest = max(largest, most[i + l]);
+        alignas(64) int32_t mine[W];
+        store((float *)mine, largest);
+        for (int l = 0; l < W; l++) most[i + l] = V{};
+        for (uint32_t m = bits(gt(largest, V{})); m; m &= m - 1) {
+            // positive floats order as integers; raising a maximum does not depend on the order
+            const int l = __builtin_ctz(m);
+            int32_t *cell = (int32_t *)max_weight + ids[i + l], seen = __atomic_load_n(cell, __ATOMIC_RELAXED);
+            while (seen < mine[l] && !__atomic_compare_exchange_n(cell, &seen, mine[l], true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+            }
+        }
+    }
 }
 
 // A tile between two calls: its blocks, and which of them still have a pixel that light comes through.
@@ -98,29 +129,32 @@ INLINE void start_blend(const TileWork &work, const Image &image, const Lanes &l
             s.t[i] = 1.f, s.r[i] = s.g[i] = s.b[i] = 0.f;
             s.depth[i] = s.best[i] = 0.f, s.id[i] = -1;
         }
-        start_alive(work, lanes, b, s.alive);
+        M alive[kVectors];
+        start_alive(work, lanes, b, alive);
+        for (int k = 0; k < kVectors; k++) store(&s.left[k * W], zero_unless(alive[k], set1(1.f)));
     }
     state.open = blocks_in_image(work, image.looked_at);
 }
 
 template <bool kDepth, bool kId, bool kWeight>
 INLINE int64_t go_on_blending(const TileWork &work, const Image &image, const Lanes &lanes, BlendState &state) {
-    Round round;
+    BlendRound round;
+    V most[kWeight ? kListed + W : 1] = {};
     int64_t pairs = 0;
     uint32_t blocks = state.open;
-    for (int64_t first = 0; first < work.count && blocks; first += kRound) {
-        const int n = int(work.count - first < kRound ? work.count - first : kRound);
+    for (int64_t first = 0; first < work.count && blocks; first += kListed) {
+        const int n = int(work.count - first < kListed ? work.count - first : kListed);
         round.gather(work, first, n);
         round.cull(blocks);
         for (int b = 0; b < kBlocks; b++) {
-            if (!(blocks >> b & 1) || !round.listed[b]) continue;
+            if (!(blocks >> b & 1)) continue;
             BlendBlock &s = state.block[b];
-            blend_block<kDepth, kId, kWeight>(round, s, lanes, b, image.max_weight);
-            pairs += round.listed[b] * int64_t(kPixels);
-            bool any_alive = false;
-            for (int k = 0; k < kVectors; k++) any_alive |= any(s.alive[k]);
-            if (!any_alive) blocks &= ~(1u << b);
+            const int64_t looked = blend_block<kDepth, kId, kWeight>(round, s, lanes, b, most);
+            if (!looked) continue;
+            pairs += looked;
+            if (!s.is_open()) blocks &= ~(1u << b);
         }
+        if (kWeight) raise_weights(round, most, image.max_weight);
     }
     state.open = blocks;
     return pairs;
@@ -151,27 +185,26 @@ int64_t blend_part(const TileWork &work, const Image &image, BlendPart part, Ble
 }
 
 // Not inlined: the compiler would see that nobody looks at most of the result.
-__attribute__((noinline)) void blend_again(const Round &round, BlendBlock &s, const Lanes &lanes) {
-    for (int i = 0; i < kPixels; i++) s.t[i] = 1.f;
+__attribute__((noinline)) void blend_again(const BlendRound &round, BlendBlock &s, const Lanes &lanes) {
+    for (int i = 0; i < kPixels; i++) s.left[i] = 1.f;
     blend_block<false, false, false>(round, s, lanes, 0, nullptr);
 }
 
 int64_t blend_limit(int64_t repeats) {
-    Round round;
+    BlendRound round;
     BlendBlock block;
     const Lanes lanes;
     __builtin_memset(&round, 0, sizeof round);
     __builtin_memset(&block, 0, sizeof block);
-    round.count = round.listed[0] = kRound;
-    for (int j = 0; j < kRound; j++) {
-        round.list[0][j] = uint16_t(j);
+    round.count = kListed;
+    for (int j = 0; j < kListed; j++) {
+        for (int k = 0; k < kStrips; k++) round.list[k][j] = uint8_t(j), round.listed[k] = kListed;
         round.field[X][j] = round.field[Y][j] = 4.f;
         round.field[L11][j] = round.field[L22][j] = 0.1f;
         round.field[LOG2_OPACITY][j] = -7.5f;
     }
-    for (int k = 0; k < kVectors; k++) block.alive[k] = ge(V{}, V{});
     for (int64_t i = 0; i < repeats; i++) blend_again(round, block, lanes);
-    return repeats * kRound * kPixels;
+    return repeats * kListed * kPixels;
 }
 
 int64_t blend_parts(const TileWork &work, const Image &image, BlendPart part, BlendState &state) {

@@ -31,11 +31,13 @@ struct Lanes {
     }
 };
 
-struct Round {
+// N Gaussians of a tile, listed for each of the kStrips parts of a block, which are rows of its vectors.
+template <int N, int kStrips> struct RoundOf {
+    static_assert(N <= 256, "lists hold bytes");
     int count;
-    int listed[kBlocks];  // how many of the round may touch each block
-    alignas(64) float field[kFields][kRound + 16];  // padded against 4 KiB aliasing
-    uint16_t list[kBlocks][kRound];
+    int listed[kBlocks * kStrips];  // how many of the round may touch each strip
+    alignas(64) float field[kFields][N + 16];  // padded against 4 KiB aliasing
+    uint8_t list[kBlocks * kStrips][N + W];
 
     // Brings in `n` records, positions relative to the tile; fetches what comes after them into the cache.
     void gather(const TileWork &work, int64_t first, int n) {
@@ -46,8 +48,7 @@ struct Round {
             const float *row[W];
             for (int l = 0; l < W; l++) {
                 row[l] = &work.records[index[i + l < n ? i + l : n - 1]].x;
-                if (first + i + l + kRound < work.count)
-                    __builtin_prefetch(&work.records[index[i + l + kRound]]);
+                if (first + i + l + N < work.count) __builtin_prefetch(&work.records[index[i + l + N]]);
             }
             V v[kFields];
             load_rows(row, kFields, v);
@@ -56,9 +57,10 @@ struct Round {
         }
     }
 
-    // For every block with a bit in `alive`, which of the round have alpha >= 1/255 somewhere in its box of pixel centres.
+    // For every block with a bit in `alive`, which of the round have alpha >= 1/255 somewhere in its box of pixel
+    // centres, and somewhere in the rows of a strip.
     void cull(uint32_t alive) {
-        for (int b = 0; b < kBlocks; b++) listed[b] = 0;
+        for (int b = 0; b < kBlocks * kStrips; b++) listed[b] = 0;
         for (int i = 0; i < count; i += W) {
             const V x = load(&field[X][i]), y = load(&field[Y][i]);
             const V l11 = load(&field[L11][i]), l12 = load(&field[L12][i]), l22 = load(&field[L22][i]);
@@ -67,28 +69,37 @@ struct Round {
             // the smallest u^2 + w^2 over a box lies on the side of it that faces the centre, in x or in y
             V x0[kAcross], x1[kAcross], lx[kAcross], best_y[kAcross];
             for (int c = 0; c < kAcross; c++) {
-                x0[c] = (c * kBlockX + 0.5f) - x, x1[c] = x0[c] + (kBlockX - 1);
+                x0[c] = (c * kBlockX + 0.5f) - x, x1[c] = x0[c] + float(kBlockX - 1);
                 const V near = min(max(V{}, x0[c]), x1[c]);
                 lx[c] = l11 * near, best_y[c] = per_dx * near;
             }
             const M valid = first_lanes(count - i);
             for (int r = 0; r < kDown; r++) {
-                const V y0 = (r * kBlockY + 0.5f) - y, y1 = y0 + (kBlockY - 1);
+                const V y0 = (r * kBlockY + 0.5f) - y, y1 = y0 + float(kBlockY - 1);
                 const V near = min(max(V{}, y0), y1);
                 const V ly = l12 * near, best_x = per_dy * near, wy = l22 * near, ww = wy * wy;
+                M rows[kStrips];
+                for (int k = 0; k < kStrips; k++) {
+                    const V top = y0 + float(k * kBlockY / kStrips), bottom = top + float(kBlockY / kStrips - 1);
+                    const V least = l22 * min(max(V{}, top), bottom);
+                    rows[k] = kStrips == 1 ? valid : both(valid, ge(reach, least * least));
+                }
                 for (int c = 0; c < kAcross; c++) {
                     const int b = r * kAcross + c;
                     if (!(alive >> b & 1)) continue;
                     const V u1 = fma(l11, min(max(best_x, x0[c]), x1[c]), ly);
                     const V dy = min(max(best_y[c], y0), y1), u2 = fma(l12, dy, lx[c]), w2 = l22 * dy;
                     const V least = min(fma(u1, u1, ww), fma(u2, u2, w2 * w2));
-                    for (uint32_t m = bits(both(valid, ge(reach, least))); m; m &= m - 1)
-                        list[b][listed[b]++] = uint16_t(i + __builtin_ctz(m));
+                    const M touched = ge(reach, least);
+                    for (int k = b * kStrips, row = 0; row < kStrips; k++, row++)
+                        listed[k] += list_lanes(both(rows[row], touched), i, &list[k][listed[k]]);
                 }
             }
         }
     }
 };
+
+using Round = RoundOf<kRound, 1>;
 
 // Visits the pixels of the tile that lie in the image: body(block, pixel in block, index in image).
 template <class Body> INLINE void for_pixels(const TileWork &work, Body body) {
@@ -137,7 +148,7 @@ INLINE void start_alive(const TileWork &work, const Lanes &lanes, int b, M *aliv
 // From one vector to the next only additions are left, which other units do than the multiplications that follow.
 struct Splat {
     V across[kColumns], u, w, du, dw, log2_opacity;
-    INLINE Splat(const Round &round, const Lanes &first, int j) {
+    template <class R> INLINE Splat(const R &round, const Lanes &first, int j) {
         const V l11 = set1(round.field[L11][j]), l12 = set1(round.field[L12][j]), l22 = set1(round.field[L22][j]);
         const V x = set1(round.field[X][j]), dy = first.y - set1(round.field[Y][j]);
         for (int c = 0; c < kColumns; c++) across[c] = l11 * (first.x[c] - x);

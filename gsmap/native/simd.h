@@ -140,6 +140,21 @@ INLINE V exp2_in_range(V x) {
 INLINE V exp2(V x) { return exp2_in_range(min(max(x, set1(-126.f)), set1(127.f))); }
 #endif
 
+// Writes the numbers of the lanes of m, plus `first`, to `out` and whatever after them, up to W bytes in all; returns how
+// many lanes there are.
+INLINE int list_lanes(M m, int first, uint8_t *out) {
+#if GSMAP_AVX512
+    const __m512i lanes = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    const __m512i chosen = _mm512_maskz_compress_epi32(m, _mm512_add_epi32(lanes, _mm512_set1_epi32(first)));
+    _mm_storeu_si128((__m128i *)out, _mm512_cvtepi32_epi8(chosen));  // without branches, which short lists mislead
+    return __builtin_popcount(m);
+#else
+    int count = 0;
+    for (uint32_t left = bits(m); left; left &= left - 1) out[count++] = uint8_t(first + __builtin_ctz(left));
+    return count;
+#endif
+}
+
 INLINE V abs(V a) { return (V)((I)a & 0x7fffffff); }
 INLINE M finite(V a) { return lt(abs(a), set1(3.4e38f)); }
 INLINE V exp(V x) { return exp2(x * 1.44269504088896341f); }
