@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from PIL import Image
 
+from gsmap._native import place_points
 from gsmap.geometry.filters import blur
-from gsmap.geometry.projection import in_image, project
 from gsmap.geometry.uncertainty import max_sigmas
 from gsmap.localize import covariance, evidence, feature_frames, matching, mismatch, probability, resection, verdict
 from gsmap.localize.candidate_renders import GREY, sample_mask
@@ -305,9 +305,11 @@ def _count_visible(scene: MapScene, refined: RefinedPose, photo: ScaledPhoto) ->
     camera = scene.camera(refined.T_metric_camera, refined.intrinsics_px, photo.size_px)
     gaussians, index = scene.chunked.seen_from(camera)
     ranges = index.visible_ranges(camera.T_camera_frame[0], camera.intrinsics_px[0], *camera.sizes_px[0].tolist())
-    means = np.concatenate([np.zeros((0, 3), np.float32), *(gaussians.means[a:b] for a, b in ranges)])
-    pixels, depth = project(means, camera.T_camera_frame[0], camera.intrinsics_px[0])
-    inside = np.flatnonzero(in_image(pixels, depth, camera.sizes_px[0]))
     one = next(render for render in refined.renders if render.scene == scene.scene)
-    column, row = pixels[inside].astype(np.int64).T
-    return int((depth[inside] * scene.S_metric_scene.scale <= _OCCLUSION * one.depth_m[row, column]).sum())
+    far = _OCCLUSION / np.float32(scene.S_metric_scene.scale) * one.depth_m
+    pose, lens = camera.T_camera_frame[0], np.ascontiguousarray(camera.intrinsics_px[0], np.float64)
+    count = 0
+    for start, stop in ranges.tolist():
+        _, row, column, depth = place_points(gaussians.means[start:stop], pose, lens, *photo.size_px, nearest=0.0)
+        count += int((depth <= far[row, column]).sum())
+    return count

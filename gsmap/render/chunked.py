@@ -74,9 +74,10 @@ class ChunkedGaussians:
             self._position_sh = np.empty((len(gaussians), 1, 3), np.float32)
         low, high = self.box
         missing = self._has_colour & ~self._has_position_colour
-        for start, stop in join_ranges(self._coarse.starts, np.flatnonzero(missing)):
-            rgb = (gaussians.means[start:stop] - low) / np.maximum(high - low, 1e-9)
-            self._position_sh[start:stop, 0] = sh0_of_rgb(rgb)
+        for chunk in np.flatnonzero(missing).tolist():  # one by one, in the cache
+            rows = slice(*self._coarse.starts[chunk : chunk + 2])
+            rgb = (gaussians.means[rows] - low) / np.maximum(high - low, 1e-9)
+            self._position_sh[rows, 0] = sh0_of_rgb(rgb)
         self._has_position_colour |= missing
         return replace(gaussians, sh=self._position_sh), index
 
