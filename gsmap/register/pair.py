@@ -223,13 +223,13 @@ def _evaluate(
     proposal = refined
     flaw = flaw or verdict.decide(proposal, seen, None if uncertainty is None else uncertainty.sigmas, params.verdict)
     in_units = None if uncertainty is None else covariance.in_scene_units(uncertainty.covariance, pair.source.unit_m)
-    strain = None
+    deformation = None
     if in_units is not None and not flaw:
-        from gsmap.register.strain import fit_strain  # imported here, as the recipe key does not need it
+        from gsmap.register.deformation import fit_deformation  # imported here, as the recipe key does not need it
 
         with watch.step("refine"):
-            found = fit_strain(*surfaces, pose)
-        if found is not None and found.is_stretched:
-            strain = found
-            in_units = in_units + covariance.in_scene_units(strain.covariance(pose.scale), pair.source.unit_m)
-    return EvaluatedPose(proposal, seen, in_units, flaw, decision, strain)
+            found = fit_deformation(*surfaces, pose)
+        if found is not None and (found.is_stretched or found.is_bent):
+            deformation = found
+            in_units = in_units + covariance.in_scene_units(deformation.covariance(pose.scale), pair.source.unit_m)
+    return EvaluatedPose(proposal, seen, in_units, flaw, decision, deformation)

@@ -25,7 +25,7 @@ from gsmap.types import Registration, Sim3
 from gsmap.types.registration import Proposal
 
 if TYPE_CHECKING:
-    from gsmap.register.strain import Strain
+    from gsmap.register.deformation import Deformation
 
 # Two poses count as the same if all their differences are below these limits: refinement would merge them.
 SAME_ROTATION_DEG = 3.0
@@ -44,7 +44,7 @@ class EvaluatedPose:
         covariance: (7, 7) covariance of the pose, translations in the source's unit; None if not computed.
         flaw: reason why the pose is not accepted; empty if it is.
         decision: decision on the scale; None if it was not measured, or if the unit of a scene is unknown.
-        strain: change of shape that would align the source; None if a similarity aligns it.
+        deformation: change of shape that would align the source; None if a similarity aligns it.
         similarity: similarity of both surfaces under the pose (`gsmap.register.repetition`); NaN if it is not known.
     """
 
@@ -53,7 +53,7 @@ class EvaluatedPose:
     covariance: np.ndarray | None
     flaw: str
     decision: ScaleDecision | None = None
-    strain: Strain | None = None
+    deformation: Deformation | None = None
     similarity: float = float("nan")
 
     @property
@@ -119,8 +119,8 @@ def select_pose(
     if accepted and status != "no_match":
         if best.decision is not None and best.decision.note:
             notes = (*notes, best.decision.note)
-        if best.strain is not None:
-            notes = (*notes, best.strain.note())
+        if best.deformation is not None:
+            notes = (*notes, best.deformation.note())
     return Registration(
         status=status,
         reason=why,
