@@ -28,10 +28,10 @@ from gsmap.cli.thin import parse_size
 PANEL = "Export", 1
 OUTPUTS = {"export": Output("exports.ExportReport"), "export --for": Output("exports.SmallMapReport")}
 _SURVEY_SUFFIXES = (".las", ".laz", ".tif", ".tiff", ".geojson", ".dxf")
-_NOT_FOR_FILES = ("--tile-size", "--budget", "--provenance", "--uncompressed", "--up", "--wait")
+_NOT_FOR_FILES = ("--tile-size", "--budget", "--provenance", "--uncompressed", "--up", "--nonrigid", "--wait")
 _NOT_FOR_PAGES = (
     *("--bbox", "--merge", "--revision", "--component", "--steps", "--budget", "--provenance", "--uncompressed"),
-    *("--prefer", "--as-of", "--static", "--tile-size", "--up", "--crs", "--pixel-size"),
+    *("--prefer", "--as-of", "--static", "--nonrigid", "--tile-size", "--up", "--crs", "--pixel-size"),
 )
 
 
@@ -135,6 +135,14 @@ def command(
             "--static", help="Export static content only, without objects that moved, appeared or disappeared."
         ),
     ] = False,
+    nonrigid: Annotated[
+        bool,
+        typer.Option(
+            "--nonrigid",
+            help="Warp captures that are stretched or bent onto those they overlap with; the capture that agrees with "
+            "most others keeps its shape.",
+        ),
+    ] = False,
     wait: Annotated[
         bool, typer.Option("--wait", help="Wait until another export to OUT has ended; default: fail.")
     ] = False,
@@ -184,6 +192,7 @@ def command(
     }
     with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         if purpose is Purpose.localize:
+            refuse_options(context, ("--nonrigid",), "--for localize")
             small = m.export_small(out, parse_size(budget or "50MB"), static=static)
             if json:
                 print_rows("export --for", small, json)
@@ -202,6 +211,7 @@ def command(
                 provenance=provenance,
                 uncompressed=uncompressed,
                 up=up,
+                nonrigid=nonrigid,
                 wait=wait,
                 **content,
             )

@@ -62,6 +62,7 @@ class TileRecipe:
         dates: capture date of each scene, by scene id, if the merger uses dates; None if it does not.
         without: digest of the Gaussians of each scene that are left out, by scene id, if any.
         unchanged: digest of the places near a tile where changes were rejected, by its component and name, if any.
+        warps: digest of the warp of each scene that is merged in another shape, by scene id, if any.
         photos: digest of the photos that a tile is fitted to, by its component and name, if any.
         up: vertical axis of the files: ``z``, that of the map, or ``y``, as viewers of the format expect it
             (`upright`); None takes the format's default (`default_up`).
@@ -79,6 +80,7 @@ class TileRecipe:
     without: Mapping[str, str] = field(default_factory=dict)
     unchanged: Mapping[tuple[int, str], str] = field(default_factory=dict)
     photos: Mapping[tuple[int, str], str] = field(default_factory=dict)
+    warps: Mapping[str, str] = field(default_factory=dict)
     up: str | None = "z"
 
     def __post_init__(self) -> None:
@@ -155,6 +157,7 @@ class TileRecipe:
         if self.dates is not None:
             inputs += [f"captured_at {scene} {self.dates.get(scene)}" for scene in scenes]
         inputs += [f"without {scene} {self.without[scene]}" for scene in scenes if self.without.get(scene)]
+        inputs += [f"warp {scene} {self.warps[scene]}" for scene in scenes if scene in self.warps]
         if unchanged := self.unchanged.get((planned.component, planned.name)):
             inputs.append(f"unchanged {unchanged}")
         if photos := self.photos.get((planned.component, planned.name)):
@@ -194,8 +197,8 @@ def _first_change(planned: PlannedTile, tile: Tile, recipe: TileRecipe) -> str:
     if set(tile.poses) != set(planned.poses):
         return "other scenes"
     return (
-        "a scene's date, the format, axis, budget, extent, metric scale or provenance, the reference photos, or the "
-        "rejected changes are others"
+        "a scene's date or warp, the format, axis, budget, extent, metric scale or provenance, the reference photos, "
+        "or the rejected changes are others"
     )
 
 

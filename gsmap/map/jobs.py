@@ -14,6 +14,7 @@ import numpy as np
 from gsmap.errors import CorruptError, InputError, StoreError
 from gsmap.geometry.metric_scale import in_metres, scale_gaussians
 from gsmap.geometry.uncertainty import max_sigmas
+from gsmap.geometry.warps import Warp, warp_cameras, warp_gaussians
 from gsmap.methods import RecipeKey
 from gsmap.store import Store, branches, remote_map, sqlite
 from gsmap.store.array_groups import ArrayResults, StagedResult
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from gsmap import register as registering
     from gsmap.export import PlannedTile
     from gsmap.merge.reference_view_cache import ReferenceViewCache
+    from gsmap.merge.tile import LazyScene
     from gsmap.register import SceneView
     from gsmap.types.merging import UnchangedPlace
 
@@ -192,6 +194,22 @@ def _without(path: str, scene_id: str, passing: OmittedContent) -> np.ndarray:
     return passing.rows(store_of(path), scene_id)
 
 
+def _warped(scene: LazyScene, warp: Warp, far: float) -> LazyScene:
+    """Return a scene in the shape that a warp gives it, which moves no point farther than ``far``."""
+
+    def load(bounds: np.ndarray | None) -> Gaussians:
+        around = None if bounds is None else bounds + np.array([[-far], [far]])
+        return warp_gaussians(scene.load(around), warp)
+
+    return replace(
+        scene,
+        load=load,
+        load_within=None,
+        cameras=None if scene.cameras is None else warp_cameras(scene.cameras, warp),
+        photos=tuple(replace(photo, camera=warp_cameras(photo.camera, warp)) for photo in scene.photos),
+    )
+
+
 def _kept(path: str, photo: StoredPhoto) -> ReferencePhoto:
     """Return a stored photo in the frame of its scene."""
     one = photo.sighting
@@ -229,6 +247,7 @@ class TileMaker:
         passing: content to leave out, by scene id.
         photos: reference photos, by scene id.
         unchanged: places of rejected changes, by scene id.
+        warps: warps of scenes, each with an upper limit of how far it moves a point, by scene id.
         cache_key: key of the merged tile among those of earlier exports (`gsmap.map.merged_tiles`).
     """
 
@@ -242,6 +261,7 @@ class TileMaker:
     passing: Mapping[str, OmittedContent] = field(default_factory=dict)
     photos: Mapping[str, Sequence[StoredPhoto]] = field(default_factory=dict)
     unchanged: Mapping[str, Sequence[UnchangedPlace]] = field(default_factory=dict)
+    warps: Mapping[str, tuple[Warp, float]] = field(default_factory=dict)
     cache_key: str = ""
 
     def __call__(self, progress: Progress) -> MergeResult:
@@ -276,6 +296,9 @@ class TileMaker:
                 tuple(self.unchanged.get(scene, ())),
             )
             for scene, pose in self.tile.poses.items()
+        ]
+        lazy = [
+            _warped(scene, *self.warps[scene.scene_id]) if scene.scene_id in self.warps else scene for scene in lazy
         ]
         bounds = self.tile.bounds if self.tile.is_cut else None
         found = merge_tile(

@@ -713,6 +713,7 @@ class Map(AbstractContextManager["Map"]):
         as_of: str | None = None,
         static: bool = False,
         up: str | None = None,
+        nonrigid: bool = False,
         wait: bool = False,
     ) -> ExportReport:
         """Export merged tiles to a folder; unchanged tiles are kept.
@@ -740,6 +741,8 @@ class Map(AbstractContextManager["Map"]):
                 comparisons of visits are made first.
             up: vertical axis of the files: ``z``, that of the map, or ``y``, as viewers of the format expect it;
                 default: ``z`` for ``ply``, ``3dtiles`` and ``streamed-sog``, ``y`` for other formats.
+            nonrigid: warp captures that are stretched or bent onto the captures they overlap with, so that no seam is
+                left. The capture with most overlap with captures that agree with it keeps its shape.
             wait: wait while another export runs in the folder.
 
         Raises:
@@ -764,6 +767,7 @@ class Map(AbstractContextManager["Map"]):
             as_of=as_of,
             static=static,
             up=up,
+            nonrigid=nonrigid,
         )
 
         def progress(fraction: float, text: str) -> None:

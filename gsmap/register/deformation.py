@@ -20,8 +20,15 @@ from gsmap.register.covariance import (
     point_to_plane_jacobian,
     robust_weights,
 )
+from gsmap.register.metric_scene import MetricPair
+from gsmap.register.params import Params
+from gsmap.register.scene_view import SceneView
 from gsmap.register.surface import Surface
 from gsmap.types import Sim3
+from gsmap.types.registration import Proposal
+
+NOTES = "one capture is bent: ", "one capture is stretched: "
+"""Beginnings of the notes on edges that no rigid pose aligns."""
 
 _RADII_M = (0.4, 0.25, 0.15, 0.1, 0.08, 0.08)  # of nearest cells: ends of stretched captures are off by decimetres
 _BORDER = 1.5  # cells between a point and its nearest cell, along the surface, at most
@@ -70,6 +77,8 @@ class Deformation:
             that under the strain alone.
         bend_m: root mean square displacement of surfaces by the bend, without what similarity and strain explain.
         length_m: length of the overlap along the direction in which it bends most.
+        finest: pose and warp that align most of the surfaces: with a bend even if too little of it is seen to name it;
+            None for ``pose`` and ``warp``.
     """
 
     warp: Warp
@@ -81,6 +90,7 @@ class Deformation:
     support: float = 1.0
     bend_m: float = 0.0
     length_m: float = 0.0
+    finest: tuple[Sim3, Warp] | None = None
 
     @property
     def spread(self) -> float:
@@ -114,17 +124,44 @@ class Deformation:
             axis = _most_bent(self.warp)
             sag = float(np.linalg.norm(self.warp.bend @ axis @ axis)) * self.length_m / (4 * self.warp.radius)
             return (
-                "one capture is bent: to fit the target, the source would have to bend along its direction "
+                f"{NOTES[0]}to fit the target, the source would have to bend along its direction "
                 f"({_text(axis)}) by {sag:.1%} of the length of the overlap; no rigid pose aligns all of it"
             )
         values, axes = np.linalg.eigh(self.warp.strain)
         odd = 0 if values[1] - values[0] > values[2] - values[1] else 2
         rest = values[[k for k in range(3) if k != odd]].mean()
         return (
-            "one capture is stretched: to fit the target, the source would have to change by "
+            f"{NOTES[1]}to fit the target, the source would have to change by "
             f"{values[odd] - rest:+.1%} along its direction ({_text(axes[:, odd])}), relative to the other directions; "
             "no rigid pose aligns all of it"
         )
+
+
+def warp_onto(
+    target: SceneView, source: SceneView, S_target_source: Sim3, *, with_scale: bool, target_warp: Warp | None = None
+) -> tuple[Sim3, Warp | None] | None:
+    """Fit the pose and, if it is stretched or bent, the warp of a source that align it with a target.
+
+    Args:
+        S_target_source: pose of the source so far.
+        with_scale: the scale of the pose was measured.
+        target_warp: warp of the target, in its frame and unit; None if it keeps its shape.
+
+    Returns:
+        The pose and the warp, which comes before the pose, in the scenes' own units; None where the overlap is too
+        small.
+    """
+    pair = MetricPair.of(target, source, Proposal("", S_target_source, with_scale, 0), Params())
+    surface = pair.target.surface()
+    if target_warp is not None:
+        surface = surface.warped(target_warp.scaled(pair.target.unit_m))
+    found = fit_deformation(surface, pair.source.surface(), pair.to_metres(S_target_source))
+    if found is None:
+        return None
+    if not (found.is_bent or found.is_stretched):
+        return pair.to_scene_units(found.pose), None
+    pose, warp = found.finest or (found.pose, found.warp)
+    return pair.to_scene_units(pose), warp.scaled(1.0 / pair.source.unit_m)
 
 
 def fit_deformation(target: Surface, source: Surface, pose: Sim3) -> Deformation | None:
@@ -181,7 +218,9 @@ def fit_deformation(target: Surface, source: Surface, pose: Sim3) -> Deformation
         bend_m=bend_m,
         length_m=float(np.ptp(inside @ _most_bent(warp))),
     )
-    return bent if bent.is_bent else found
+    if bent.is_bent:
+        return bent
+    return replace(found, finest=(bent.pose, bent.warp)) if bent.support > 1.0 else found
 
 
 def _align(

@@ -10,6 +10,7 @@ import numpy as np
 from gsmap.geometry.cells import cell_means
 from gsmap.geometry.floaters import find_floaters
 from gsmap.geometry.sh import rgb_of_sh0
+from gsmap.geometry.warps import Warp
 from gsmap.register import visible_side
 from gsmap.register.view_cache import ViewCache
 from gsmap.render import ChunkIndex
@@ -129,6 +130,22 @@ class Surface:
     def scaled(self, factor: float) -> Surface:
         """Multiply all coordinates by ``factor``: convert the surface to a unit that is ``factor`` times smaller."""
         return self if factor == 1.0 else Surface(self.points * factor, self.colours, self.resolution_m)
+
+    def warped(self, warp: Warp) -> Surface:
+        """Return the surface with its cells moved by a warp in metres, and their normals turned by it."""
+        points, colours = self.coarse
+        turns = np.linalg.inv(warp.jacobians(points)).transpose(0, 2, 1)
+        out = Surface(warp.apply(points), colours, self.resolution_m)
+        out.coarse = out.points, out.colours
+
+        def turned(normals: np.ndarray) -> np.ndarray:
+            normals = np.einsum("nij,nj->ni", turns, normals)
+            unit: np.ndarray = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+            return unit
+
+        out.normals = turned(self.normals)
+        out.oriented_normals = None if self.oriented_normals is None else turned(self.oriented_normals)
+        return out
 
     @cached_property
     def coarse(self) -> tuple[np.ndarray, np.ndarray]:

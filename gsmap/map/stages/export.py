@@ -22,6 +22,7 @@ from gsmap.export.pyramid import TreeLayout, is_stale, remove_tree_files
 from gsmap.export.streamed_sog import StreamedSog, write_streams
 from gsmap.export.tileset import Tiles3D, write_tilesets, write_whole_map
 from gsmap.geometry.transforms import transform_cameras
+from gsmap.geometry.warps import Warp
 from gsmap.map.date_filter import end_of_date, is_until, undated_note
 from gsmap.map.georeferenced_components import GeoreferencedComponent, georeferenced_components, world_notes
 from gsmap.map.jobs import OmittedContent, TileMaker
@@ -58,6 +59,7 @@ class Request:
         as_of: use only scenes dated at or before this.
         static: export static content only.
         up: vertical axis of the files; None for the format's default.
+        nonrigid: warp captures that are stretched or bent onto those they overlap with.
     """
 
     format: str = "spz"
@@ -74,6 +76,7 @@ class Request:
     as_of: str | None = None
     static: bool = False
     up: str | None = None
+    nonrigid: bool = False
 
     def options(self) -> list[str]:
         """Return the command-line options of ``gsmap export`` for this request."""
@@ -105,6 +108,7 @@ class ExportPlan:
         world: georeferenced components.
         passing: content to leave out of each scene.
         photos: reference photos by component and tile name.
+        warps: warps of scenes that are merged in another shape, each with an upper limit of how far it moves a point.
         unchanged: places of rejected changes near a tile, by scene id, by component and tile name.
     """
 
@@ -119,11 +123,12 @@ class ExportPlan:
     world: Mapping[int, GeoreferencedComponent] = field(default_factory=dict)
     passing: Mapping[str, OmittedContent] = field(default_factory=dict)
     photos: Mapping[tuple[int, str], Sequence[StoredPhoto]] = field(default_factory=dict)
+    warps: Mapping[str, tuple[Warp, float]] = field(default_factory=dict)
     unchanged: Mapping[tuple[int, str], Mapping[str, Sequence[UnchangedPlace]]] = field(default_factory=dict)
 
 
 def plan(store: Store, request: Request, settings: Settings, find_omitted: FindOmitted | None = None) -> ExportPlan:
-    """Plan the tiles of an export from the catalog.
+    """Plan the tiles of an export from the catalog; warps are fitted to the surfaces of scenes.
 
     Args:
         find_omitted: needed for an export of static content.
@@ -152,6 +157,16 @@ def plan(store: Store, request: Request, settings: Settings, find_omitted: FindO
     if request.as_of is not None:
         scenes, notes = _as_of(scenes, request.as_of)
         placed = {scene: placed[scene] for scene in scenes}
+    bounds = {scene: found.bounds for scene, found in scenes.items()}
+    warps: dict[str, tuple[Warp, float]] = {}
+    if request.nonrigid:
+        from gsmap.map.stages.nonrigid import warp_captures  # imported here, as it imports registration
+
+        warped = warp_captures(store, settings, graph, placed, scenes)
+        placed, notes = {**placed, **warped.poses}, notes + warped.notes
+        warps = {scene: (warp, warp.largest_motion(bounds[scene])) for scene, warp in warped.warps.items()}
+        bounds |= {scene: np.array([[-far], [far]]) + bounds[scene] for scene, (_, far) in warps.items()}
+        recipe = replace(recipe, warps=warped.digests())
     rejected: dict[str, list[UnchangedPlace]] = {}
     if uses_dates(method, params):
         recipe = recipe.with_dates({scene: found.captured_at for scene, found in scenes.items()})
@@ -175,7 +190,7 @@ def plan(store: Store, request: Request, settings: Settings, find_omitted: FindO
     notes += world_notes(world, request.format, recipe.up)
     tiles = plan_tiles(
         {scene: pose.S_map_scene for scene, pose in placed.items()},
-        {scene: found.bounds for scene, found in scenes.items()},
+        bounds,
         tile_size_m=request.tile_size_m,
         num_gaussians={scene: found.num_gaussians for scene, found in scenes.items()},
         components={scene: pose.component for scene, pose in placed.items()},
@@ -190,7 +205,9 @@ def plan(store: Store, request: Request, settings: Settings, find_omitted: FindO
     near = {(tile.component, tile.name): places_near(rejected, tile, around_m) for tile in tiles if rejected}
     unchanged = {tile: places for tile, places in near.items() if places}
     recipe = replace(recipe, unchanged={tile: _digest_places(places) for tile, places in unchanged.items()})
-    return ExportPlan(revision, scenes, method, params, recipe, tiles, notes, metres, world, passing, photos, unchanged)
+    return ExportPlan(
+        revision, scenes, method, params, recipe, tiles, notes, metres, world, passing, photos, warps, unchanged
+    )
 
 
 def _photos(
@@ -391,6 +408,7 @@ def make_content(store: Store, planned: ExportPlan, settings: Settings, tile: Pl
         store=ReferenceViewCache(folder, settings.export.max_shared_bytes),
         passing={scene: planned.passing[scene] for scene in tile.poses if scene in planned.passing},
         unchanged=planned.unchanged.get((tile.component, tile.name), {}),
+        warps={scene: planned.warps[scene] for scene in tile.poses if scene in planned.warps},
         photos=_by_scene(planned.photos.get((tile.component, tile.name), ())),
     )
 
