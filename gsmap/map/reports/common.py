@@ -38,11 +38,12 @@ class SceneMapping(dict[str, Any]):
 
 
 def up_directions(graphs: Iterable[StoredGraph], scenes: Iterable[Scene | SceneSummary]) -> dict[str, np.ndarray]:
-    """Return the up direction (3,) of scenes by id, in their own frames: that of the last graph in the list that
-    knows it, or the one kept when the scene was thinned. Scenes without a known direction are left out.
+    """Return the up direction (3,) of scenes by id, in their own frames: that of the last graph in the list, or
+    the one kept when the scene was thinned. Scenes without a known direction are left out.
     """
-    known = [(scene.id, scene.thinning.up) for scene in scenes if scene.thinning is not None]
-    known += [(graph.scene, graph.up) for graph in graphs]
+    last = {graph.scene: graph.up for graph in graphs}
+    of_thinned = {scene.id: scene.thinning.up for scene in scenes if scene.thinning is not None}
+    known = [*of_thinned.items(), *last.items()]
     return {scene: np.array(up, np.float64) for scene, up in known if up is not None}
 
 
