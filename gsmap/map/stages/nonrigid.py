@@ -52,15 +52,13 @@ class WarpedCaptures:
     notes: tuple[str, ...]
 
     def digests(self) -> dict[str, str]:
-        """Return a digest of each scene's warp, rounded to what moves surfaces by less than a millimetre."""
-        return {
-            scene: text_digest(
-                canonical(
-                    plain([np.round(w.centre, 3), round(w.radius, 3), np.round(w.strain, 4), np.round(w.bend, 4)])
-                )
-            )[:32]
-            for scene, w in self.warps.items()
-        }
+        """Return a digest of each scene's warp, rounded to about a ten-thousandth of its radius."""
+        found = {}
+        for scene, warp in self.warps.items():
+            parts = (warp.centre / warp.radius, 3), (warp.strain, 4), (warp.bend, 4)
+            rounded = [np.round(part, decimals) + 0.0 for part, decimals in parts]  # no -0.0
+            found[scene] = text_digest(canonical([f"{warp.radius:.4g}", *plain(rounded)]))[:32]
+        return found
 
 
 def warp_captures(
