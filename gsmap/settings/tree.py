@@ -180,7 +180,7 @@ def _set(tree: Any, path: list[str], value: Any, name: str, root: Any) -> Any:
     except ConfigError as error:
         if error.code != "out_of_range":
             raise
-        raise ConfigError(f"{name}: {error}", code=error.code) from None
+        raise ConfigError(f"{name.removesuffix(path[0])}{error}", code=error.code) from None
 
 
 def _unknown(name: str, root: Any) -> ConfigError:
