@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from furnished_room import furnished_room
 from raising import raises
 
 import gsmap.map
@@ -17,6 +19,7 @@ from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.warps import Warp
 from gsmap.map import Map
 from gsmap.map.jobs import _warped
+from gsmap.map.stages.nonrigid import WarpedCaptures
 from gsmap.merge.tile import LazyScene
 from gsmap.methods import RecipeKey
 from gsmap.register.deformation import NOTES
@@ -56,17 +59,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Map]:
 
 
 def room(seed: int) -> np.ndarray:
-    """Points on the walls, the floor and the furniture of a room of 6 x 5 x 2.5 m about the origin."""
-    rng, parts = np.random.default_rng(seed), []
-    boxes = [((0, 0, 0), (6, 5, 2.5)), ((1, 1, 0), (2, 2.5, 0.8)), ((4, 3, 0), (5.2, 3.6, 1.9))]
-    for low, high in np.array(boxes, np.float64):
-        for axis in range(3):
-            for side in (low, high):
-                area = np.prod(np.delete(high - low, axis))
-                points = rng.uniform(low, high, (int(250 * area), 3))
-                points[:, axis] = side[axis] + rng.normal(0, 0.003, len(points))
-                parts.append(points)
-    return np.concatenate(parts) - [3, 2.5, 1.25]
+    return furnished_room(seed, noise_m=0.003, per_m2=250)
 
 
 def bend(points: np.ndarray) -> np.ndarray:
@@ -170,3 +163,15 @@ def test_a_map_without_bends_is_merged_as_it_is(site: Map, tmp_path: Path) -> No
 def test_an_undescribed_capture_is_refused(site: Map, tmp_path: Path) -> None:
     with raises(InputError, code="no_graph"):
         site.with_settings({"describe.landmarks": False}).export(tmp_path / "out", nonrigid=True)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+def test_a_warp_is_named_by_what_it_does_in_any_unit(unit: float) -> None:
+    rng = np.random.default_rng(3)
+    warp = Warp(rng.uniform(1, 2, 3) / unit, 3.0 / unit, 0.02 * np.eye(3), np.zeros((3, 3, 3)))
+
+    def digest(**changed: np.ndarray) -> str:
+        return WarpedCaptures({}, {"a": replace(warp, **changed)}, ()).digests()["a"]
+
+    assert digest(centre=warp.centre + 1e-6 * warp.radius, bend=np.full((3, 3, 3), -1e-9)) == digest()
+    assert len({digest(), digest(strain=0.021 * np.eye(3)), digest(bend=np.full((3, 3, 3), 1e-3))}) == 3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from furnished_room import furnished_room
 from scipy.spatial.transform import Rotation
 
 from gsmap.geometry.umeyama import umeyama
@@ -15,17 +16,7 @@ POSE = Sim3(Rotation.from_euler("xyz", [10, -30, 120], degrees=True).as_matrix()
 
 
 def room(seed: int, noise_m: float) -> np.ndarray:
-    """Points on the walls, the floor and the furniture of a room of 6 x 5 x 2.5 m."""
-    rng, parts = np.random.default_rng(seed), []
-    boxes = [((0, 0, 0), (6, 5, 2.5)), ((1, 1, 0), (2, 2.5, 0.8)), ((4, 3, 0), (5.2, 3.6, 1.9))]
-    for low, high in np.array(boxes, np.float64):
-        for axis in range(3):
-            for side in (low, high):
-                area = np.prod(np.delete(high - low, axis))
-                points = rng.uniform(low, high, (int(900 * area), 3))
-                points[:, axis] = side[axis] + rng.normal(0, noise_m, len(points))
-                parts.append(points)
-    return np.concatenate(parts)
+    return furnished_room(seed, noise_m=noise_m, per_m2=900)
 
 
 def surface(points: np.ndarray) -> Surface:
@@ -37,8 +28,8 @@ def surface(points: np.ndarray) -> Surface:
 def test_a_stretched_source_is_named_with_its_axis(stretch: float, axis: int) -> None:
     change = np.eye(3)
     change[axis, axis] += stretch
-    source = POSE.inverse().apply(room(1, 0.004) - [3, 2.5, 1.25])
-    found = fit_deformation(surface(room(0, 0.004) - [3, 2.5, 1.25]), surface(source @ change), POSE)
+    source = POSE.inverse().apply(room(1, 0.004))
+    found = fit_deformation(surface(room(0, 0.004)), surface(source @ change), POSE)
     assert found is not None
     assert found.is_stretched
     assert not found.is_bent
@@ -61,10 +52,10 @@ def test_a_stretched_source_is_named_with_its_axis(stretch: float, axis: int) ->
 @pytest.mark.guards("answers")
 @pytest.mark.parametrize("seed", range(4))
 def test_rigid_and_scaled_sources_are_not_stretched(seed: int) -> None:
-    source = POSE.inverse().apply(room(10 + seed, 0.006) - [3, 2.5, 1.25])
+    source = POSE.inverse().apply(room(10 + seed, 0.006))
     for scale in (1.0, 1.02):
         pose = Sim3(POSE.rotation, POSE.translation, 1 / scale)
-        found = fit_deformation(surface(room(seed, 0.006) - [3, 2.5, 1.25]), surface(source * scale), pose)
+        found = fit_deformation(surface(room(seed, 0.006)), surface(source * scale), pose)
         assert found is not None
         assert not found.is_stretched
         assert not found.is_bent
@@ -75,7 +66,7 @@ def test_rigid_and_scaled_sources_are_not_stretched(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_direction_that_no_surface_crosses_says_nothing(seed: int) -> None:
     """The overlap of two halves of a room is a slab without walls at its ends."""
-    target, source = room(seed, 0.005) - [3, 2.5, 1.25], room(20 + seed, 0.005) - [3, 2.5, 1.25]
+    target, source = room(seed, 0.005), room(20 + seed, 0.005)
     target, source = target[target[:, 0] < 0.8], source[source[:, 0] > -0.8]
     found = fit_deformation(surface(target), surface(POSE.inverse().apply(source)), POSE)
     assert found is None or not found.is_stretched
@@ -86,11 +77,11 @@ def test_a_direction_that_no_surface_crosses_says_nothing(seed: int) -> None:
 def test_a_bent_source_is_named_and_the_warp_undoes_the_bend(percent: float, along: int, towards: int) -> None:
     """The middle of the room sags by some percent of its length, x' = x + a y^2."""
     length = (6.0, 5.0)[along]
-    flat = room(1, 0.004) - [3, 2.5, 1.25]
+    flat = room(1, 0.004)
     bent = flat.copy()
     bent[:, towards] += percent / 100 * length * (flat[:, along] / (length / 2)) ** 2
     source = POSE.inverse()
-    found = fit_deformation(surface(room(0, 0.004) - [3, 2.5, 1.25]), surface(source.apply(bent)), POSE)
+    found = fit_deformation(surface(room(0, 0.004)), surface(source.apply(bent)), POSE)
     assert found is not None
     assert found.is_bent
     assert not found.is_stretched
@@ -109,10 +100,10 @@ def test_a_bent_source_is_named_and_the_warp_undoes_the_bend(percent: float, alo
 @pytest.mark.guards("answers")
 def test_a_dent_is_not_a_bend() -> None:
     """A wall that bulges in one place is a change of the place: the rest of it predicts no such bulge."""
-    source = room(1, 0.004) - [3, 2.5, 1.25]
+    source = room(1, 0.004)
     near = np.exp(-((source - [3.0, 0.5, 0.0]) ** 2).sum(1) / (2 * 0.6**2))
     source[:, 0] += 0.06 * near
-    found = fit_deformation(surface(room(0, 0.004) - [3, 2.5, 1.25]), surface(POSE.inverse().apply(source)), POSE)
+    found = fit_deformation(surface(room(0, 0.004)), surface(POSE.inverse().apply(source)), POSE)
     assert found is not None
     assert not found.is_bent
 
