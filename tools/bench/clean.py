@@ -21,7 +21,6 @@ from gsmap.geometry.floaters import find_detached
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, Sim3
-from gsmap_synthetic.bake import ray_scene
 from gsmap_synthetic.make import DemoCapture
 from gsmap_synthetic.perturb import strewn
 from tools.harness import argument_parser, print_table, say, timed
@@ -105,9 +104,9 @@ def distance_to_truth(gaussians: Gaussians, capture: DemoCapture, place: synthet
 
     skin = place.skin.with_shut(range(len(place.doors)))
     points = Sim3.from_matrix(capture.T_scene_world).inverse().apply(gaussians.means.astype(np.float64))
-    distances: np.ndarray = (
-        ray_scene(skin.corners[skin.present]).compute_distance(open3d.core.Tensor(points.astype(np.float32))).numpy()
-    )
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(*(open3d.core.Tensor(part) for part in skin.mesh()))
+    distances: np.ndarray = scene.compute_distance(open3d.core.Tensor(points.astype(np.float32))).numpy()
     return distances
 
 
