@@ -84,7 +84,8 @@ REASONS: Final[Mapping[str, tuple[str, str]]] = {
     "outvoted": ("Too few edges agree against those that contradict them.", r"\d+ edges agree and \d+ others"),
     "surfaces_differ": (
         "Both scenes may show two places that look alike, or one that changed.",
-        r"the captures show two places that look alike|\S+% of what both saw is not the same",
+        r"the captures show two places that look alike|edges of this map that are as likely|"
+        r"\S+% of what both saw is not the same",
     ),
     "too_few_edges": ("Too few agreeing edges join two large components.", r"would join two (components|islands)"),
     "unconfirmed": (

@@ -114,7 +114,9 @@ def find_first_contradicted(
         agrees |= new & tied & state.accepted
         contradicted |= new & _within(m, state.accepted) & ~state.accepted
         below = step
-    for bar in np.unique(rank[contradicted & known]).tolist():
+    # A bar at the lowest rank separates nothing: a contradicted edge is then as likely as all the others.
+    above_lowest = rank > rank[eligible & known].min(initial=len(m))
+    for bar in np.unique(rank[contradicted & known & above_lowest]).tolist():
         above = rank >= bar
         if (
             aliasing_probability(int((agrees & above).sum()), int((contradicted & above).sum()))

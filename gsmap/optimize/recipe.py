@@ -9,7 +9,7 @@ from gsmap.optimize.params import Params
 from gsmap.types.plain import plain
 
 VERSIONS = {
-    "optimize": 7,
+    "optimize": 8,
     "optimize.incremental": 7,
     "perceptual_aliasing": 1,
     "gravity_align": 1,

@@ -77,7 +77,7 @@ def _outcomes(
         if firm[k]:
             out[key] = EdgeOutcome("used", residual)
         elif state.accepted[k] and state.doubtful[k]:
-            why = reason("surfaces_differ", f"{_look_alike_text(m, k)}, or one that changed")
+            why = reason("surfaces_differ", f"{_doubt_text(m, k, params)}, or one that changed")
             out[key] = EdgeOutcome("tentative", residual, why)
         elif state.accepted[k]:
             why = _REPEATED if repeated[k] else reason("unconfirmed", "in no agreeing cycle: no other edge confirms it")
@@ -89,7 +89,7 @@ def _outcomes(
             if repeated[k]:
                 why = _REPEATED
             if state.doubtful[k]:
-                why = reason("surfaces_differ", f"{_look_alike_text(m, k)}; {why}")
+                why = reason("surfaces_differ", f"{_doubt_text(m, k, params)}; {why}")
             elif state.ambiguous[k]:
                 why = reason(
                     "contradicts_edge",
@@ -106,14 +106,16 @@ def _outcomes(
             if cycles.agree[k] > 0:
                 why += "; other edges that contradict them agree with it (a place that looks alike?)"
             if state.doubtful[k]:
-                why += f"; {_look_alike_text(m, k)}"
+                why += f"; {_doubt_text(m, k, params)}"
             doubtful = "tentative" in (status[m.targets[k]], status[m.sources[k]])
             undecided = bool(cycles.agree[k] > 0 or doubtful or state.undecided[k] or state.rejected[k])
             out[key] = EdgeOutcome("unused", residual, why, undecided)
     return out
 
 
-def _look_alike_text(m: Measurements, row: int) -> str:
+def _doubt_text(m: Measurements, row: int, params: Params) -> str:
+    if m.look_alike[row] <= params.max_look_alike:
+        return "edges of this map that are as likely contradict others: they may join two places that look alike"
     return f"the captures show two places that look alike with a probability of {m.look_alike[row]:.0%}"
 
 

@@ -108,6 +108,20 @@ def test_a_place_that_changed_is_tied_tentatively():
     assert "one visit" in now.outcomes["s0", "s3"].reason
 
 
+def test_one_wrong_edge_among_equally_likely_ones_leaves_the_others_used():
+    rng = np.random.default_rng(0)
+    truth = poses_at(np.c_[4.0 * np.arange(12), np.zeros((12, 2))])
+    ids = [f"s{k:02d}" for k in range(12)]
+    near = np.array([(k, k + step) for step in (1, 2) for k in range(12 - step)])
+    right = [replace(e, look_alike=SURE, log_odds_wrong=-39.4) for e in true_edges(truth, near, rng, ids)]
+    (far,) = true_edges(truth, np.array([(4, 7)]), rng, ids)
+    away = Sim3(far.S_target_source.rotation, far.S_target_source.translation + 2.0)
+    wrong = replace(far, S_target_source=away, look_alike=SURE, log_odds_wrong=-39.4)
+    answer = optimize(ids, [*right, wrong], params=QUICK)
+    assert uses(answer, right) == {"used"}
+    assert answer.use(wrong.target, wrong.source) == "unused"
+
+
 @pytest.mark.parametrize("given", [float("nan"), SURE])
 def test_what_the_others_bear_out_is_used(given):
     rng = np.random.default_rng(0)
