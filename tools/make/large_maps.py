@@ -338,8 +338,9 @@ def verbs(one: Filled, scratch: Path) -> dict[str, Callable[[], object]]:
     """
     m = one.map
     names = m.store.scenes.names()
-    middle, first, second = (names[one.order[k]] for k in (one.num_scenes // 2, -1, -2))
+    middle, second = (names[one.order[k]] for k in (one.num_scenes // 2, -2))
     pair = one.some_pair()
+    left, right = pair.split(":")
 
     def add_and_update() -> None:
         one.add()
@@ -376,7 +377,7 @@ def verbs(one: Filled, scratch: Path) -> dict[str, Callable[[], object]]:
         "show OBJECT": lambda: m.history("o2"),
         "why A:B": lambda: m.why(pair),
         "poses": m.pose_rows,
-        "measure": lambda: m.measure(f"{first}:0,0,0", f"{second}:0,0,0"),
+        "measure": lambda: m.measure(f"{left}:0,0,0", f"{right}:0,0,0"),
         "settings": m.setting_rows,
         "changes, nothing dated": m.changes,
         "edit SCENE": lambda: m.edit(middle, note="wet"),
