@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.warps import Warp
 from gsmap.map import Map
 from gsmap.map.jobs import _warped
-from gsmap.map.stages.nonrigid import WarpedCaptures
+from gsmap.map.stages.nonrigid import WarpedCaptures, deformed_pairs
 from gsmap.merge.tile import LazyScene
 from gsmap.methods import RecipeKey
 from gsmap.register.deformation import NOTES
@@ -114,6 +115,15 @@ def test_bent_captures_are_warped_onto_those_that_agree(site: Map, tmp_path: Pat
         "capture bent is warped onto right",
         "capture after is warped onto bent",
     )
+
+
+def test_pairs_are_deformed_by_their_edge_or_those_between_them(site: Map) -> None:
+    ids = {scene.name: scene.id for scene in site.scenes()}
+    graph = site.store.revisions.get()
+    assert graph is not None
+    pairs = [(ids[a], ids[b]) for a, b in itertools.combinations(BENT, 2)]
+    found = deformed_pairs(site.store, site.settings, graph, pairs)
+    assert set(found) == {(ids[a], ids[b]) for a in ("left", "right") for b in ("bent", "after")}
 
 
 def test_a_tile_is_made_again_for_another_warp(site: Map, tmp_path: Path) -> None:

@@ -25,15 +25,19 @@ from gsmap.geometry.warps import deform_gaussians
 from gsmap.map import Map
 from gsmap.types import Cameras, Gaussians
 from gsmap_synthetic import make_captures, write_captures
+from tools.bench.change_scores import claims_of, score_changes
 from tools.harness import argument_parser, print_table, say
+from tools.make.change_truth import Truth
 
 _STRETCHED = re.compile(r"change by ([+-][\d.]+)% along")
+SURE = 0.8
 _BENT = re.compile(r"would have to bend along")
 Capture = tuple[Gaussians, Cameras]
 
 
 def main() -> None:
     parser = argument_parser(__doc__)
+    parser.add_argument("--changes", type=Path, nargs="+", help="folders of tools/make/change.py")
     parser.add_argument("--made", type=int, nargs="*", default=[21, 22, 23, 24], help="seeds of places")
     parser.add_argument("--bend", action="store_true", help="bend the captures instead of stretching them")
     parser.add_argument("--percent", type=float, nargs="+", default=[0, 1, 2, 3, 4])
@@ -41,6 +45,9 @@ def main() -> None:
     parser.add_argument("--pairs", nargs="*", default=[], help="of captures, A:B")
     given = parser.parse_args()
     rng = np.random.default_rng(0)
+    if given.changes:
+        _print_changes(given.changes, given.percent, bend=given.bend)
+        return
     counts = {percent: [0, 0, 0, 0, 0.0] for percent in given.percent}
     with tempfile.TemporaryDirectory(prefix="gsmap-deform-") as folder:
         for name, target, source in _pairs(given.made, given.captures, given.pairs, Path(folder)):
@@ -62,6 +69,45 @@ def _pairs(seeds: list[int], captures: Path | None, pairs: list[str], folder: Pa
         yield f"place {seed}", *(_read(place, path.stem) for path in write_captures(place, made))
     for pair in pairs:
         yield pair.replace(":", "-"), *(_read(captures, name) for name in pair.split(":"))
+
+
+def _print_changes(places: list[Path], percents: list[float], *, bend: bool) -> None:
+    """Print what is claimed and found of each deformation, over all pairs."""
+    columns = ["deformation, %", "pairs", "compared", "named", "claims", "false", f"false, confidence >= {SURE}"]
+    counts = {percent: np.zeros(8, dtype=int) for percent in percents}
+    for folder in places:
+        truth = Truth(folder)
+        for percent, row in counts.items():
+            for newer in truth.times[1:]:
+                rng = np.random.default_rng([int(10 * percent), *folder.name.encode()])
+                first = _read(folder, truth.times[0])
+                older = bent(*first, percent, rng) if bend else stretched(*first, percent, int(rng.integers(3)))
+                found = _compared(truth, older, newer)
+                row += found
+                say(f"{folder.name} {percent:g} % {newer}: {found}")
+    print_table([*columns, "changed objects", "found"], [[percent, *row] for percent, row in counts.items()])
+
+
+def _compared(truth: Truth, older: Capture, newer: str) -> list[int]:
+    """Compare a deformed first capture with another one; return the counts of a row."""
+    with tempfile.TemporaryDirectory(prefix="gsmap-deform-") as folder, gsmap.map.create(Path(folder) / "m.gsmap") as m:
+        first = truth.times[0]
+        m.ingest(older[0], cameras=older[1], name=first, captured_at=truth.captured_at(first))
+        gaussians, cameras = _read(truth.folder, newer)
+        m.ingest(gaussians, cameras=cameras, name=newer, captured_at=truth.captured_at(newer))
+        m.update()
+        poses = {row.name: row.component for row in m.scene_rows()}
+        if poses[first] != poses[newer]:
+            return [1, 0, 0, 0, 0, 0, 0, 0]
+        named = any(_STRETCHED.search(note) or _BENT.search(note) for note in m.show_pair(f"{first}:{newer}").notes)
+        m.changes()
+        (one,) = m.store.changes.current()
+        claims = [change for change in m.store.changes.load(one.number).changes if len(change.voxels)]
+    S_place_frame = truth.T_place_scene(newer) @ one.S_frame_newer.inverse()
+    found = score_changes(truth, first, newer, claims_of(claims, S_place_frame))
+    wrong = [not row["right"] for row in found["claim_rows"]]
+    sure = sum(bad and claim.confidence >= SURE for bad, claim in zip(wrong, claims, strict=True))
+    return [1, 1, named, len(claims), sum(wrong), sure, found["objects"], found["found"]]
 
 
 def _read(folder: Path, name: str) -> Capture:

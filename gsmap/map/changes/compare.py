@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from gsmap import change
 from gsmap.engine import run_jobs
 from gsmap.errors import InputError, NotFoundError
 from gsmap.geometry.metric_scale import in_metres
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.geometry.warps import Warp, warp_cameras, warp_gaussians
 from gsmap.map.changes.visits import Visit, has_moved, pairs_of_visits
 from gsmap.map.date_filter import NO_DATE, parse_moment
 from gsmap.map.jobs import store_of
 from gsmap.map.metric_scales import metres_of_scenes
 from gsmap.map.settings import Settings
 from gsmap.map.shared_jobs import SharedJobs, note_interruption
+from gsmap.map.stages.nonrigid import DeformedPair, deformed_pairs
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
 from gsmap.store.change_rows import Comparison
@@ -24,6 +28,9 @@ from gsmap.types import ChangeReport, PosedScene, Scene, Sim3
 from gsmap.types.progress import StageProgress
 
 _NAMED = 5  # scenes that a remark names
+_NOT_COMPARED = (
+    "not compared: a capture is bent or stretched, and they share too little to fit its shape, or lack a graph"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +41,13 @@ class ComparisonPlan:
         visits: dated scenes with a pose, by scene id.
         pairs: (older, newer) scene ids.
         notes: scenes that are left out, with the reason.
+        deformed: the pairs of which the older scene is warped onto the newer one.
     """
 
     visits: dict[str, Visit]
     pairs: list[tuple[str, str]]
     notes: tuple[str, ...]
+    deformed: Mapping[tuple[str, str], DeformedPair]
 
 
 def plan_comparisons(store: Store, settings: Settings, pair: tuple[Scene, Scene] | None = None) -> ComparisonPlan:
@@ -73,7 +82,8 @@ def plan_comparisons(store: Store, settings: Settings, pair: tuple[Scene, Scene]
         notes = [f"{_names(undated)} no date: which one is newer is not known ({NO_DATE})"] if undated else []
         if unplaced:
             notes.append(f"{_names(unplaced)} no place in the map yet: run gsmap update")
-        return ComparisonPlan(visits, pairs_of_visits(list(visits.values()), settings.visits), tuple(notes))
+        pairs = pairs_of_visits(list(visits.values()), settings.visits)
+        return ComparisonPlan(visits, pairs, tuple(notes), deformed_pairs(store, settings, graph, pairs))
     for scene in pair:
         if scene.id not in graph.poses:
             raise NotFoundError(
@@ -94,7 +104,8 @@ def plan_comparisons(store: Store, settings: Settings, pair: tuple[Scene, Scene]
             f"{pair[0].name} and {pair[1].name} lie in two components, so their relative pose is unknown",
             code="different_components",
         )
-    return ComparisonPlan(visits, [(older.scene, newer.scene)], ())
+    pairs = [(older.scene, newer.scene)]
+    return ComparisonPlan(visits, pairs, (), deformed_pairs(store, settings, graph, pairs))
 
 
 def missing_comparisons(store: Store, asked: ComparisonPlan, settings: Settings) -> list[tuple[str, str]]:
@@ -107,15 +118,26 @@ def missing_comparisons(store: Store, asked: ComparisonPlan, settings: Settings)
 
 def standing_comparisons(store: Store, settings: Settings) -> list[Comparison]:
     """Return the comparisons of visits that hold at the present poses, by whatever recipe, also of pairs that a person
-    asked for: exports may act on their changes."""
-    visits = plan_comparisons(store, settings).visits
+    asked for: exports may act on their changes. Of deformed pairs only the current recipe holds, as another one may
+    have compared them without a warp."""
+    asked = plan_comparisons(store, settings)
+    visits = asked.visits
     dated = (one for one in store.changes.current() if one.older in visits and one.newer in visits)
-    return [
+    found = [
         one
         for one in dated
         if visits[one.older].component == visits[one.newer].component
         and visits[one.older].when < visits[one.newer].when
         and _stands(one, visits)
+    ]
+    pairs = [(one.older, one.newer) for one in found]
+    graph = store.revisions.get()
+    assert graph is not None
+    asked = replace(asked, deformed=deformed_pairs(store, settings, graph, pairs))
+    return [
+        one
+        for one, pair in zip(found, pairs, strict=True)
+        if pair not in asked.deformed or one.key == _key(settings, asked, *pair).digest
     ]
 
 
@@ -175,16 +197,17 @@ def _valid(current: Iterable[Comparison], asked: ComparisonPlan, settings: Setti
 
 
 def _key(settings: Settings, asked: ComparisonPlan, older: str, newer: str) -> RecipeKey:
-    """Return the key of a pair's comparison, which depends on the metric scale."""
-    metres = asked.visits[newer].metres_per_unit
-    scaled = [] if metres == 1.0 else [f"metres_per_unit {metres!r}"]
-    return change.recipe_key(settings.change).of(older, newer, *scaled)
+    """Return the key of a pair's comparison, which depends on the metric scale and on what warps the older scene."""
+    metres, deformed = asked.visits[newer].metres_per_unit, asked.deformed.get((older, newer))
+    inputs = [] if metres == 1.0 else [f"metres_per_unit {metres!r}"]
+    inputs += [] if deformed is None else deformed.inputs()
+    return change.recipe_key(settings.change).of(older, newer, *inputs)
 
 
 def _job(store: Store, asked: ComparisonPlan, settings: Settings, pair: tuple[str, str]) -> tuple[object, ...]:
     """Return the arguments of `compare_scenes`."""
     sides = [(visit.scene, visit.S_map_scene, visit.when.isoformat()) for visit in (asked.visits[s] for s in pair)]
-    return (store.location, *sides, settings.change)
+    return (store.location, *sides, settings.change, asked.deformed.get(pair))
 
 
 def _names(names: Sequence[str]) -> str:
@@ -194,21 +217,41 @@ def _names(names: Sequence[str]) -> str:
 
 
 def compare_scenes(
-    path: str, older: tuple[str, Sim3, str], newer: tuple[str, Sim3, str], params: change.Params
+    path: str,
+    older: tuple[str, Sim3, str],
+    newer: tuple[str, Sim3, str],
+    params: change.Params,
+    deformed: DeformedPair | None = None,
 ) -> tuple[ChangeReport, tuple[int, int]]:
     """Compare two scenes of the map at ``path``; return the changes and the number of Gaussians of each.
 
     Args:
         older, newer: scene id, S_map_scene and date.
+        deformed: the older scene is warped onto the newer one, unless it fits without a warp.
     """
-    before, after = _posed(path, *older), _posed(path, *newer)
-    return change.compare(before, after, params), (len(before.gaussians), len(after.gaussians))
+    notes, warp, S_map_older = tuple[str, ...](), None, older[1]
+    if deformed is not None:
+        store = store_of(path)
+        fitted = deformed.fit(store, newer[0], older[0], newer[1].inverse() @ S_map_older)
+        if fitted is None:
+            return ChangeReport((), 0.0, np.ones(3), (_NOT_COMPARED,)), (0, 0)
+        S_newer_older, warp = fitted
+        S_map_older = newer[1] @ S_newer_older
+        if warp is not None:
+            name = store.scenes.get(older[0]).name
+            notes = (f"no rigid pose aligns all of both captures: {name} is warped onto the other to compare them",)
+    before, after = _posed(path, older[0], S_map_older, older[2], warp), _posed(path, *newer)
+    report = change.compare(before, after, params)
+    return replace(report, notes=(*notes, *report.notes)), (len(before.gaussians), len(after.gaussians))
 
 
-def _posed(path: str, scene_id: str, S_map_scene: Sim3, captured_at: str) -> PosedScene:
-    """Return a scene in the map frame with its view-independent colour, which is all that comparisons use."""
+def _posed(path: str, scene_id: str, S_map_scene: Sim3, captured_at: str, warp: Warp | None = None) -> PosedScene:
+    """Return a scene in the map frame, in the shape that a warp gives it, with its view-independent colour, which is
+    all that comparisons use."""
     scenes = store_of(path).scenes
     gaussians, cameras = scenes.unread(scene_id).degree_0(), scenes.cameras(scene_id)
+    if warp is not None:
+        gaussians, cameras = warp_gaussians(gaussians, warp), warp_cameras(cameras, warp)
     return PosedScene(
         transform_gaussians(gaussians, S_map_scene), transform_cameras(cameras, S_map_scene), scene_id, captured_at
     )

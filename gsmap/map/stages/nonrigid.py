@@ -1,8 +1,9 @@
-"""Choose which captures keep their shape, and warp those onto them that no rigid pose aligns."""
+"""Warp captures that no rigid pose aligns: for an export all onto one that keeps its shape, for a comparison one onto
+the other."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,9 +14,10 @@ from gsmap.map.jobs import load_view
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys, without_graph
 from gsmap.methods import text_digest
+from gsmap.register import VERSION
 from gsmap.register.deformation import NOTES, warp_onto
 from gsmap.store import Store
-from gsmap.types import PoseGraph, Registration, Scene, ScenePose
+from gsmap.types import PoseGraph, Registration, Scene, ScenePose, Sim3
 from gsmap.types.plain import canonical, plain
 
 
@@ -35,6 +37,31 @@ class _Edge:
     @property
     def ends(self) -> tuple[str, str]:
         return self.registration.target, self.registration.source
+
+
+@dataclass(frozen=True)
+class DeformedPair:
+    """A pair of scenes of which no rigid pose may align all.
+
+    Args:
+        graphs: digest of the key of each scene's graph, by scene id; scenes without a graph are left out.
+        with_scale: the scale of the relative pose was measured.
+    """
+
+    graphs: Mapping[str, str]
+    with_scale: bool
+
+    def inputs(self) -> list[str]:
+        """Return what a warp depends on besides the pose, for the key of a result."""
+        return [f"warped {VERSION}", *(f"graph {scene} {self.graphs[scene]}" for scene in sorted(self.graphs))]
+
+    def fit(self, store: Store, target: str, source: str, S_target_source: Sim3) -> tuple[Sim3, Warp | None] | None:
+        """Fit the pose and, if it needs one, the warp of the source (`gsmap.register.deformation.warp_onto`); None
+        where a graph is missing or the overlap is too small."""
+        if len(self.graphs) < 2:
+            return None
+        views = [load_view(store, scene, self.graphs[scene]) for scene in (target, source)]
+        return warp_onto(views[0], views[1], S_target_source, with_scale=self.with_scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +137,38 @@ def warp_captures(
                 warps[child] = warp
                 notes.append(f"capture {names[0]} is warped onto {names[1]}")
     return WarpedCaptures(poses, warps, tuple(notes))
+
+
+def deformed_pairs(
+    store: Store, settings: Settings, graph: PoseGraph, pairs: Collection[tuple[str, str]]
+) -> dict[tuple[str, str], DeformedPair]:
+    """Return the pairs of scenes that no rigid pose may align: their own edge is named as stretched or bent, or they
+    have none and no path of other edges joins them."""
+    if not pairs or not any(store.registrations.current_with_note(note) for note in NOTES):
+        return {}
+    edges = {frozenset(edge.ends): edge for edge in _used_edges(store, graph, graph.poses)}
+    shapes = {scene: {scene} for scene in graph.poses}
+    for edge in edges.values():
+        target, source = (shapes[end] for end in edge.ends)
+        if not edge.is_deformed and target is not source:
+            target |= source
+            shapes |= dict.fromkeys(source, target)
+    own = {pair: edges.get(frozenset(pair)) for pair in pairs}
+    deformed = {graph.poses[edge.ends[0]].component for edge in edges.values() if edge.is_deformed}
+    found = [
+        pair
+        for pair, edge in own.items()
+        if (edge.is_deformed if edge else graph.poses[pair[0]].component in deformed and pair[1] not in shapes[pair[0]])
+    ]
+    scenes = [store.scenes.get(scene) for scene in sorted({scene for pair in found for scene in pair})]
+    keys = graph_keys(store, scenes, settings)
+    lacking = without_graph(store, keys)
+    graphs = {scene: key.digest for scene, key in keys.items() if scene not in lacking}
+    return {
+        pair: DeformedPair({scene: graphs[scene] for scene in pair if scene in graphs}, bool(edge and edge.with_scale))
+        for pair, edge in own.items()
+        if pair in found
+    }
 
 
 def _used_edges(store: Store, graph: PoseGraph, placed: Mapping[str, ScenePose]) -> list[_Edge]:
