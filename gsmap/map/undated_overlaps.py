@@ -14,7 +14,10 @@ _MIN_DIFFERENCE = 0.005  # smaller fractions of the surface would be printed as 
 
 
 def undated_notes(store: Store, scenes: Collection[Scene | SceneSummary]) -> tuple[str, ...]:
-    """Return a note if registered pairs of the scenes differ and a scene of the pair has no date."""
+    """Return a note if registered pairs of the scenes differ and a scene of the pair has no date.
+
+    Pairs that no rigid pose aligns do not count, as surfaces that lie apart are measured as a difference.
+    """
     names = {scene.id: scene.name for scene in scenes}
     undated = {scene.id for scene in scenes if scene.captured_at is None}
     if not undated:
@@ -25,6 +28,12 @@ def undated_notes(store: Store, scenes: Collection[Scene | SceneSummary]) -> tup
         if {edge.target, edge.source} <= names.keys() and {edge.target, edge.source} & undated
     }
     differences = {pair: share for pair, share in differences.items() if share >= _MIN_DIFFERENCE}
+    if differences:
+        from gsmap.register.deformation import NOTES  # imported here, as few maps need it
+
+        deformed = [one.registration for note in NOTES for one in store.registrations.current_with_note(note)]
+        ends = {f"{names.get(one.target)}:{names.get(one.source)}" for one in deformed}
+        differences = {pair: share for pair, share in differences.items() if pair not in ends}
     if not differences:
         return ()
     worst = max(differences, key=lambda pair: differences[pair])

@@ -101,7 +101,8 @@ def off_m(means: np.ndarray) -> float:
 
 @pytest.mark.guards("answers")
 def test_bent_captures_are_warped_onto_those_that_agree(site: Map, tmp_path: Path) -> None:
-    before, _ = exported(site, tmp_path / "rigid")
+    before, rigid = exported(site, tmp_path / "rigid")
+    assert "2 pairs (left:bent, right:bent)" in " ".join(rigid.notes)
     after, report = exported(site, tmp_path / "nonrigid", nonrigid=True)
     for name in ("left", "right"):  # keep pose and shape
         np.testing.assert_array_equal(after[name], before[name])

@@ -9,12 +9,19 @@ def scene(name, date=None):
     return SimpleNamespace(id=f"id-{name}", name=name, captured_at=date)
 
 
-def store(**differences):
+def store(bent=(), **differences):
     edges = [
         SimpleNamespace(target=f"id-{pair[0]}", source=f"id-{pair[1]}", disagreement=share)
         for pair, share in differences.items()
     ]
-    return SimpleNamespace(registrations=SimpleNamespace(summaries=lambda usable: edges))
+    noted = [SimpleNamespace(registration=edge) for edge in edges if edge.target[-1] + edge.source[-1] in bent]
+
+    def current_with_note(text):
+        return noted if text.startswith("one capture is bent") else []
+
+    return SimpleNamespace(
+        registrations=SimpleNamespace(summaries=lambda usable: edges, current_with_note=current_with_note)
+    )
 
 
 def test_differences_of_undated_overlaps_are_noted_in_numbers():
@@ -23,6 +30,14 @@ def test_differences_of_undated_overlaps_are_noted_in_numbers():
     assert note.startswith("3 pairs ")
     assert "5.0%" in note
     assert "8.0% (b:c)" in note
+
+
+def test_bent_pairs_do_not_count():
+    scenes = [scene("a"), scene("b"), scene("c")]
+    (note,) = undated_notes(store(bent=("bc",), ab=0.02, bc=0.08), scenes)
+    assert note.startswith("1 pair ")
+    assert "8.0%" not in note
+    assert undated_notes(store(bent=("bc",), bc=0.08), scenes) == ()
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, float("nan")])

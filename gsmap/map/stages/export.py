@@ -159,14 +159,16 @@ def plan(store: Store, request: Request, settings: Settings, find_omitted: FindO
         placed = {scene: placed[scene] for scene in scenes}
     bounds = {scene: found.bounds for scene, found in scenes.items()}
     warps: dict[str, tuple[Warp, float]] = {}
-    if request.nonrigid:
-        from gsmap.map.stages.nonrigid import warp_captures  # imported here, as it imports registration
+    from gsmap.map.stages.nonrigid import rigid_note, warp_captures  # imported here, as it imports registration
 
+    if request.nonrigid:
         warped = warp_captures(store, settings, graph, placed, scenes)
         placed, notes = {**placed, **warped.poses}, notes + warped.notes
         warps = {scene: (warp, warp.largest_motion(bounds[scene])) for scene, warp in warped.warps.items()}
         bounds |= {scene: np.array([[-far], [far]]) + bounds[scene] for scene, (_, far) in warps.items()}
         recipe = replace(recipe, warps=warped.digests())
+    else:
+        notes += rigid_note(store, graph, placed, scenes)
     rejected: dict[str, list[UnchangedPlace]] = {}
     if uses_dates(method, params):
         recipe = recipe.with_dates({scene: found.captured_at for scene, found in scenes.items()})

@@ -17,6 +17,7 @@ from gsmap.methods import text_digest
 from gsmap.register import VERSION
 from gsmap.register.deformation import NOTES, warp_onto
 from gsmap.store import Store
+from gsmap.texts import counted, few
 from gsmap.types import PoseGraph, Registration, Scene, ScenePose, Sim3
 from gsmap.types.plain import canonical, plain
 
@@ -169,6 +170,22 @@ def deformed_pairs(
         for pair, edge in own.items()
         if pair in found
     }
+
+
+def rigid_note(
+    store: Store, graph: PoseGraph, placed: Mapping[str, ScenePose], scenes: Mapping[str, Scene]
+) -> tuple[str, ...]:
+    """Return a note on the pairs that no rigid pose aligns, for a merge that warps nothing."""
+    if not any(store.registrations.current_with_note(note) for note in NOTES):
+        return ()
+    edges = [edge for edge in _used_edges(store, graph, placed) if edge.is_deformed]
+    if not edges:
+        return ()
+    names = few(sorted(":".join(scenes[end].name for end in edge.ends) for edge in edges))
+    return (
+        f"no rigid pose aligns all of {counted(len(edges), 'pair')} ({names}), since a capture is bent or stretched: "
+        "surfaces are double, or missing from the older capture; --nonrigid warps it",
+    )
 
 
 def _used_edges(store: Store, graph: PoseGraph, placed: Mapping[str, ScenePose]) -> list[_Edge]:
