@@ -12,6 +12,7 @@ import importlib.util
 import shutil
 import subprocess
 import tempfile
+import threading
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ import torch
 
 from gsmap.render import backends, blending_weights, cuda_fit, cuda_kernels, gsplat
 
+_LAUNCHING = threading.Lock()  # the emulation keeps the state of one launch
 MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE = 0.999, 1 / 255, 1e-4  # as its kernels have them
 
 
@@ -38,6 +40,7 @@ def gsplat_on_cpu(monkeypatch):
     }
     for name, function in functions.items():
         monkeypatch.setattr(package, name, function)
+        monkeypatch.setattr(package.rendering, name, function)  # of its own `rasterization`
     monkeypatch.setattr(gsplat, "load", lambda: package)
     monkeypatch.setattr(gsplat, "device", lambda: torch.device("cpu"))
     monkeypatch.setattr(gsplat, "_device_cache", gsplat._DeviceCache())
@@ -63,7 +66,8 @@ def _emulated_kernels():
 def _launch(file, kernel, blocks, threads, *arguments, shared=0, num_sh=None):
     values = [ctypes.c_void_p(a.data_ptr()) if isinstance(a, torch.Tensor) else ctypes.c_int32(a) for a in arguments]
     pointers = (ctypes.c_void_p * len(values))(*(ctypes.cast(ctypes.byref(v), ctypes.c_void_p) for v in values))
-    assert not _emulated_kernels().launch(kernel.encode(), blocks, threads, shared, pointers)
+    with _LAUNCHING:
+        assert not _emulated_kernels().launch(kernel.encode(), blocks, threads, shared, pointers)
 
 
 def _projection(means, covars, quats, scales, viewmats, Ks, width, height, opacities=None, packed=False, **options):

@@ -1,6 +1,10 @@
 """The CUDA backend against the native one: on a GPU where there is one, and everywhere by `gsplat_reference`."""
 
+import json
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -388,3 +392,13 @@ def test_without_gsplat_the_error_names_the_extra(monkeypatch):
     gaussians, cameras = random_scene(1)
     with raises(MissingDependencyError, code="missing_dependency"):
         render(GaussianTensors.of(gaussians), cameras, backend="gsplat")
+
+
+@pytest.mark.slow
+def test_the_bench_for_a_gpu_runs_dry_here(shared_data, tmp_path):
+    pytest.importorskip("gsplat")
+    command = [sys.executable, "-m", "tools.bench.gpu", shared_data, "--dry-run", "--json", tmp_path / "gpu.json"]
+    subprocess.run(command, check=True, cwd=Path(__file__).parents[2])
+    parts = json.loads((tmp_path / "gpu.json").read_text())
+    assert len(parts) == 7
+    assert all(parts.values())
