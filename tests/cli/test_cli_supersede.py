@@ -120,7 +120,8 @@ def test_the_same_file_undoes_it_and_what_was_withdrawn_stays_so(site: Path, cli
     first = scenes(cli, site)["left"]["id"]
     write_capture(tmp_path, "left", Sim3.identity(), *LEFT, seed=0)
     with gsmap.map.open(site) as m:
-        m.ingest(again(tmp_path), supersedes="left")
+        (row,) = m.ingest(again(tmp_path), supersedes="left")
+        assert len(row.notes) == 1, "a rejected pair is no edge that could hold"
         m.confirm("left:right", withdraw=True)
         m.remove_prior("left")
         m.ingest(tmp_path / "left.ply", supersedes="left")

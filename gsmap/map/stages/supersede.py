@@ -87,6 +87,7 @@ def supersede(
     view = SceneView(coming.id, capture.gaussians, capture.cameras, graph, capture.scale_policy)
     _check_frame(old, _view(store, old, settings), view, settings)
     carried = list(_carried(store, old, coming, view, settings, progress))
+    edges = _usable_neighbours(store, old)
     # A date that was read beside the capture does not overrule what was said of the same frames.
     dated = capture.captured_at is not None and (not capture.dated_by or old.captured_at is None)
     dated_by = ["", *(fact.author for fact in store.scenes.facts(old.id) if fact.kind == "captured_at")][-1]
@@ -115,10 +116,10 @@ def supersede(
             elif (before := store.registrations.get(*ends)) is not None and before.review is not None:
                 store.registrations.review(*ends, "withdraw")  # of content that returns: withdrawn since
     progress("ingest", 1.0, f"{scene.name} in the place of {old.id[:12]}")
-    held = [one.edge.status for one in carried if one.edge.S_target_source is not None]
     notes = [f"it replaced scene {old.id[:12]} ({old.name})"]
-    if held:
-        notes.append(f"{held.count('accepted')} of {len(held)} edges hold: gsmap optimize {store.location} uses them")
+    if edges:
+        held = len(edges & _usable_neighbours(store, scene))
+        notes.append(f"{held} of {len(edges)} edges hold: gsmap optimize {store.location} uses them")
     return SupersedeResult(scene, tuple(notes))
 
 
@@ -201,6 +202,12 @@ def _carried(
             found = replace(alike, notes=(*edge.notes, f"confirmed of scene {old.id[:12]}; of this: {found.reason}"))
         key = recipe.of(keys[found.target].digest, keys[found.source].digest)
         yield _CarriedEdge(found, key, *word)
+
+
+def _usable_neighbours(store: Store, scene: Scene) -> set[str]:
+    """Return the scenes (ids) that usable edges connect with a scene."""
+    edges = store.registrations.current_of_scene(scene.id)
+    return {end for edge in edges if edge.is_usable for end in _ends(edge)} - {scene.id}
 
 
 def _ends(stored: StoredRegistration) -> Sequence[str]:
