@@ -1011,7 +1011,7 @@ class Map(AbstractContextManager["Map"]):
         if graph is not None:
             return graph, ""
         newest = self.store.graphs.load(scene.id)
-        return newest, "" if newest is None else note
+        return newest, "" if newest is None or scene.thinning else note  # a thinned scene is not described again
 
     def diff(self, before: int, after: int) -> Table[PoseChangeRow]:
         """List how each scene moved between two revisions (``gsmap diff MAP R1 R2``), measured at the scene's

@@ -12,8 +12,9 @@ from raising import raises
 import gsmap.map
 from gsmap.errors import ConfigError, StoreError
 from gsmap.map import Map
+from gsmap.map.thinning.thin import THINGS
 from gsmap.methods import RecipeKey
-from gsmap.types import PoseGraph, ScenePose, Sim3
+from gsmap.types import PoseGraph, SceneGraph, ScenePose, Sim3
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "merge"))
 
@@ -43,6 +44,9 @@ def test_old_captures_that_newer_ones_saw_are_thinned_and_a_dry_run_changes_noth
         assert {row.scene_name: row.thinned for row in report.scenes} == {"w0": True, "w1": True}
         assert report.num_bytes_freed > 0
         assert [scene.thinning is None for scene in m.scenes()] == [False, False, True]
+        for scene in m.scenes():
+            m.store.graphs.save(SceneGraph(scene.id, {}, None, 1.0), THINGS.of(scene.id))
+        assert ["gsmap update" in str(m.show_scene(scene.id).notes) for scene in m.scenes()] == [False, False, True]
         assert m.check().ok
         assert not m.thin(keep_days=2800, now=NOW).scenes
 
