@@ -102,10 +102,8 @@ def _steps(pair: PairReport, settings: Settings) -> list[ExplanationStep]:
     if pair.review:
         steps.append(ExplanationStep(name="review", value=pair.review))
     if pair.status == "accepted":
-        used = pair.used if isinstance(pair.used, str) else "used" if pair.used else "unused"
-        steps.append(
-            ExplanationStep(name="the other edges", value=used, bar="bear it out: used", passed=pair.used is True)
-        )
+        passed = None if pair.unsolved else pair.use == "used"
+        steps.append(ExplanationStep(name="the other edges", value=pair.use, bar="bear it out: used", passed=passed))
     return steps
 
 

@@ -43,7 +43,7 @@ _STANDING = {
     "empty": "Empty",
 }
 _KINDS = {"scenes": "captures", "graphs": "scene graphs", "indexes": "retrieval index", "models": "networks"}
-_ORDER = ("undecided", "tentative", "unused", "used", "rejected", "no_match", "never registered")
+_ORDER = ("undecided", "tentative", "unsolved", "unused", "used", "rejected", "no_match", "never registered")
 
 
 def page(report: Report) -> str:
@@ -218,6 +218,7 @@ _LEGEND = {
     "tentative": "tentative: no cycle confirms it",
     "undecided": "undecided: contradicts another edge",
     "unused": "accepted, but not used",
+    "unsolved": "newer than the poses",
     "rejected": "rejected",
     "no_match": "registered, no match",
 }

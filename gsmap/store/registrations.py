@@ -343,6 +343,25 @@ class Registrations:
                 newest |= {row.key: row for row in connection.execute(query)}
         return [_stored_one(newest[digest], None).registration for digest in wanted if digest in newest]
 
+    def changed_since(self, moment: str, edges: Iterable[StoredRegistration]) -> set[int]:
+        """Return the numbers of those current registrations that `optimize` would have used otherwise at a moment."""
+        pairs = {":".join(sorted((one.registration.target, one.registration.source))): one for one in edges}
+        then: dict[str, EdgeSummary] = {}
+        with self._catalog.read() as connection:
+            words = connection.execute(select(reviews).order_by(reviews.c.number)).all()
+            reviewed = {word.pair for word in words if word.created_at > moment}
+            asked = [pair for pair, one in pairs.items() if one.created_at > moment or pair in reviewed]
+            earlier = _by_pair([word for word in words if word.created_at <= moment])
+            for start in range(0, len(asked), recipes.KEYS_PER_QUERY):
+                some = registrations.c.pair.in_(asked[start : start + recipes.KEYS_PER_QUERY])
+                query = select(*_SUMMARY_COLUMNS, null(), *_undecoded("proposer")).order_by(registrations.c.number)
+                rows = connection.execute(query.where(some, registrations.c.created_at <= moment)).all()
+                for pair, of_pair in _by_pair(rows).items():
+                    row, review = _find_current(of_pair, map(_review, earlier.get(pair, ())))
+                    if row is not None:
+                        then[pair] = _summary(tuple(row)[:-1], review, {})
+        return {pairs[pair].number for pair in asked if _used(pairs[pair]) != _used(then.get(pair))}
+
     def stored_keys(self, keys: Iterable[RecipeKey | str], *, after: int = 0) -> set[str]:
         """Return, as digests, the keys that have a registration with a number above ``after``."""
         with self._catalog.read() as connection:
@@ -633,6 +652,20 @@ def _keys_of_repeated_pairs(connection: Connection, wanted: ColumnElement[bool])
 
 def _is_usable(status: str, review: str | None) -> bool:
     return review == "confirm" or (status == "accepted" and review != "reject")
+
+
+def _used(one: StoredRegistration | EdgeSummary | None) -> tuple[str | int, str | None] | None:
+    """Return what identifies a pair's registration to `optimize`; None if it uses none."""
+    if one is None or not (one.is_usable if isinstance(one, StoredRegistration) else one.usable):
+        return None
+    return one.key or one.number, one.review
+
+
+def _by_pair(rows: Iterable[Any]) -> dict[str, list[Row[Any]]]:
+    found: dict[str, list[Row[Any]]] = {}
+    for row in rows:
+        found.setdefault(str(row.pair), []).append(row)
+    return found
 
 
 _ends_of = attrgetter("target", "source")

@@ -56,7 +56,7 @@ def test_edges_are_filtered_by_the_words_that_their_table_shows(site: Path, cli:
 
 def test_a_confirmed_pair_is_no_longer_tentative(site: Path, cli: Run) -> None:
     assert "one pair" not in cli("confirm", site, "left:right").stdout
-    assert cli("list", site, "edges", "--status", "used", "--json").json["edges"][0]["used"] is True
+    assert cli("list", site, "edges", "--status", "unsolved", "--json").json["edges"][0]["used"] is True
     assert pairs(cli, site, "tentative") == []
     assert "one pair" in cli("confirm", site, "left:right", "--withdraw").stdout
     assert pairs(cli, site, "tentative") == [{"left", "right"}]
@@ -77,3 +77,30 @@ def test_several_pairs_are_judged_on_the_page(site: Path) -> None:
         m.optimize()
         (row,) = [row for row in m.status().todo if row.what == "one_pair"]
     assert shlex.split(row.verb)[:2] == ["gsmap", "view"]
+
+
+def test_an_edge_reviewed_since_the_last_optimize_is_unsolved(site: Path, cli: Run) -> None:
+    def uses() -> list[str]:
+        with gsmap.map.open(site) as m:
+            (shown,) = (row.use for row in m.show_scene("left").edges if row.scene_name == "right")
+            assert m.show_pair("left:right").use == shown
+            return [row.use for row in m.edge_rows() if row.pair == "left:right"]
+
+    assert uses() == ["one pair"]
+    assert "unsolved" in cli("reject", site, "left:right").stdout
+    assert uses() == ["unsolved"]
+    assert pairs(cli, site, "unsolved") == [{"left", "right"}]
+    assert pairs(cli, site, "tentative") == []
+    page = site.with_name("report.html")
+    cli("report", site, page)
+    assert "tag unsolved" in page.read_text()
+    assert "unsolved" not in cli("reject", site, "left:right", "--withdraw").stdout  # as it was solved
+    cli("reject", site, "left:right")
+    cli("optimize", site)
+    assert uses() == [""]
+    cli("reject", site, "left:right", "--withdraw")
+    assert uses() == ["unsolved"]
+    cli("optimize", site)
+    assert uses() == ["one pair"]
+    with gsmap.map.open(site) as m:
+        assert m.add_edge("left:right", Sim3(np.eye(3), np.array([9.0, 0, 0])), np.full(7, 0.01)).use == "unsolved"

@@ -103,6 +103,7 @@ def _edges_of(store: Store, scene: Scene) -> tuple[SceneEdgeRow, ...]:
                 scene_name=row.target_name if at_target else row.source_name,
                 status=row.status,
                 used=row.used,
+                use=row.use,
                 overlap=row.overlap,
                 num_inliers=row.num_inliers,
                 reason=row.reason,

@@ -22,11 +22,12 @@ Outcomes = Mapping[tuple[str, str], EdgeOutcome]
 _FEW = 1000  # scenes that one query names; beyond, all outcomes are read
 EDGE_STATUSES = ("accepted", "rejected", "no_match")
 EDGE_USES: Mapping[str, Callable[[EdgeRow], bool]] = {
-    "used": lambda row: row.used is True,
+    "used": lambda row: row.use == "used",
     ONE_PAIR: lambda row: row.use == ONE_PAIR,
-    "tentative": lambda row: row.used == "tentative",  # as JSON has it: those of one pair, too
-    "undecided": lambda row: row.undecided,
+    "tentative": lambda row: row.use in ("tentative", ONE_PAIR),  # as JSON has it: those of one pair, too
+    "undecided": lambda row: row.use == "undecided",
     "unused": lambda row: row.use == "unused",
+    "unsolved": lambda row: row.unsolved,
 }
 """Words for the use of an edge by the last optimize, by which edges can also be filtered."""
 
@@ -103,11 +104,13 @@ def rows_of_registrations(store: Store, edges: Iterable[StoredRegistration], *sc
     Args:
         scenes: ids, at least one of each pair; all where none is named.
     """
+    edges, newest = list(edges), store.revisions.newest()
+    unsolved = store.registrations.changed_since(newest.created_at if newest else "", edges)
     outcomes, name_of = store.revisions.outcomes(*(scenes if len(scenes) <= _FEW else ())), names(store)
-    return [_edge_row(stored, outcomes, name_of) for stored in edges]
+    return [_edge_row(stored, outcomes, name_of, stored.number in unsolved) for stored in edges]
 
 
-def _edge_row(stored: StoredRegistration, outcomes: Outcomes, name_of: Mapping[str, str]) -> EdgeRow:
+def _edge_row(stored: StoredRegistration, outcomes: Outcomes, name_of: Mapping[str, str], unsolved: bool) -> EdgeRow:
     edge = stored.registration
     outcome = outcomes.get((edge.target, edge.source))
     status, why = edge.status, edge.reason or (outcome.reason if outcome else "")
@@ -127,6 +130,7 @@ def _edge_row(stored: StoredRegistration, outcomes: Outcomes, name_of: Mapping[s
         "seconds": {step: edge.seconds.get(step, 0.0) for step in ("match", "refine", "verdict")},
         "used": used,
         "undecided": outcome is not None and outcome.undecided,
+        "unsolved": unsolved,
         "review": stored.review,
         "registered_at": stored.created_at,
     }
@@ -159,7 +163,7 @@ def pair_report(store: Store, a: Scene, b: Scene) -> PairReport:
     outcomes, edge = store.revisions.outcomes(a.id), current.registration
     outcome = outcomes.get((edge.target, edge.source))
     return PairReport(
-        **vars(_edge_row(current, outcomes, {a.id: a.name, b.id: b.name})),
+        **vars(rows_of_registrations(store, [current], a.id)[0]),
         exact=edge.exact,
         evidence=edge.evidence,
         residual_chi2=outcome.residual_chi2 if outcome else None,

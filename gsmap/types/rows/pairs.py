@@ -47,6 +47,8 @@ class EdgeRow(RegisteredPose, PairRef):
         seconds: wall time in seconds of ``match``, ``refine`` and ``verdict``.
         used: use by the last optimize: true, false, or ``"tentative"`` (neither a cycle nor a review confirms it).
         undecided: true if another group of edges contradicts it and nothing decides between them.
+        unsolved: true if the edge or its review is newer than the last optimize, which ``used`` and ``undecided`` are
+            of.
         review: standing review: ``confirm`` or ``reject``; null if unreviewed.
         registered_at: time of the registration, ISO 8601 with zone.
     """
@@ -64,7 +66,10 @@ class EdgeRow(RegisteredPose, PairRef):
     @property
     def use(self) -> str:
         """``used``, ``one pair`` (it places a scene alone, and nothing contradicts it), ``tentative`` (in doubt),
-        ``undecided``, ``unused``, or empty if it is not accepted: the words by which edges are filtered."""
+        ``undecided``, ``unused``, ``unsolved``, or empty if it is not accepted: the words by which edges are
+        filtered."""
+        if self.unsolved:
+            return "unsolved"
         if self.undecided:
             return "undecided"
         if self.used == "tentative":
@@ -78,6 +83,7 @@ class EdgeRow(RegisteredPose, PairRef):
     seconds: Mapping[str, float]
     used: bool | str
     undecided: bool = False
+    unsolved: bool = False
     review: str | None = None
     registered_at: str | None = None
 

@@ -166,6 +166,7 @@ class SceneEdgeRow(SceneRef):
         scene_name: name of the scene at the other end.
         status: as in `EdgeRow`.
         used: as in `EdgeRow`.
+        use: `EdgeRow.use`.
         overlap: as in `EdgeRow`.
         num_inliers: as in `EdgeRow`.
         reason: as in `EdgeRow`.
@@ -175,7 +176,7 @@ class SceneEdgeRow(SceneRef):
     columns: ClassVar[Mapping[str, str]] = {
         "scene_name": "edge with",
         "status": "status",
-        "used": "used",
+        "use": "use",
         "overlap": "overlap",
         "num_inliers": "inliers",
         "reason": "reason",
@@ -183,6 +184,7 @@ class SceneEdgeRow(SceneRef):
 
     status: str
     used: bool | str
+    use: str
     overlap: float
     num_inliers: int
     reason: str
