@@ -19,7 +19,7 @@ from gsmap.register.scene_view import SceneView
 from gsmap.register.timing import Stopwatch
 from gsmap.types import Registration, Sim3
 from gsmap.types.progress import Progress, silent
-from gsmap.types.registration import Proposal
+from gsmap.types.registration import Proposal, Support
 
 # Share of the proposed pose's inliers that must be inliers of the refined pose, too; with fewer the proposed pose is
 # evaluated instead.
@@ -150,11 +150,18 @@ def _compare_elsewhere(
             known.append(S)
     # In a place that repeats, correspondences favour no period: each counts as much as the most probable pose.
     proposals = [replace(best.proposal, S_target_source=S, support=None) for S, _ in left[: params.max_poses]]
-    evaluated = [*evaluated, *(_evaluate(proposal, target, source, params, watch) for proposal in proposals)]
+    repeated = [_evaluate(proposal, target, source, params, watch) for proposal in proposals]
+    evaluated = [*evaluated, *(replace(j, own=_supported(j.proposal, best.proposal.support)) for j in repeated)]
     with watch.step("verdict"):
         poses = [pair.to_metres(j.proposal.S_target_source) for j in evaluated]
         compared = [replace(j, similarity=repetition.similarity(S)) for j, S in zip(evaluated, poses, strict=True)]
     return compared, [similarity for _, similarity in left[params.max_poses :]]
+
+
+def _supported(proposal: Proposal, support: Support | None) -> Proposal:
+    """Return a proposal with the number of inliers and of false alarms that it has by given correspondences."""
+    num_inliers, log_nfa = (0, float("nan")) if support is None else support.count(proposal.S_target_source)
+    return replace(proposal, num_inliers=num_inliers, log_nfa=log_nfa, runner_up=float("nan"))
 
 
 def _evaluate(

@@ -46,6 +46,8 @@ class EvaluatedPose:
         decision: decision on the scale; None if it was not measured, or if the unit of a scene is unknown.
         deformation: change of shape that would align the source; None if a similarity aligns it.
         similarity: similarity of both surfaces under the pose (`gsmap.register.repetition`); NaN if it is not known.
+        own: the proposal with its own inliers, if the pose repeats another: ``proposal`` then counts as much as that of
+            the other pose. None for other poses.
     """
 
     proposal: Proposal
@@ -55,6 +57,7 @@ class EvaluatedPose:
     decision: ScaleDecision | None = None
     deformation: Deformation | None = None
     similarity: float = float("nan")
+    own: Proposal | None = None
 
     @property
     def information(self) -> np.ndarray | None:
@@ -89,7 +92,8 @@ def select_pose(
         )
         return Registration(status="no_match", reason=why, notes=tuple(notes), **common)
     accepted = [j for j in evaluated if not j.flaw]
-    best = _most_similar(accepted) if accepted else min(evaluated, key=_sort_key)
+    best = _most_similar(accepted) if accepted else min((j for j in evaluated if j.own is None), key=_sort_key)
+    stated = best.own or best.proposal
     status, why = ("accepted", "") if accepted else ("rejected", best.flaw)
     # A pose that is too uncertain to become an edge still counts as a rival.
     others = [j for j in evaluated if not _same(best, j, target, source) and _may_be_correct(j, best, params)]
@@ -126,8 +130,8 @@ def select_pose(
         reason=why,
         S_target_source=best.proposal.S_target_source if status != "no_match" else None,
         information=best.information if status != "no_match" else None,  # a person may confirm a rejected pair
-        num_inliers=best.proposal.num_inliers,
-        num_correspondences=best.proposal.num_correspondences,
+        num_inliers=stated.num_inliers,
+        num_correspondences=stated.num_correspondences,
         overlap=best.evidence.overlap,
         proposer=best.proposal.proposer,
         exact=best.proposal.exact,
@@ -217,15 +221,15 @@ def _probability_among(best: EvaluatedPose, others: Sequence[EvaluatedPose], num
 
 def _evidence_figures(evaluated: EvaluatedPose, probable: float, alike: float) -> dict[str, float]:
     """Return the evidence as stored with the registration; see `gsmap.types.Registration`."""
-    p, e = evaluated.proposal, evaluated.evidence
+    p, e, stated = evaluated.proposal, evaluated.evidence, evaluated.own or evaluated.proposal
     log_scale = log_scale_sigma = float("nan")
     if evaluated.decision is not None:
         log_scale, log_scale_sigma = evaluated.decision.log_scale, evaluated.decision.measured_sigma
     elif evaluated.covariance is not None:
         log_scale, log_scale_sigma = float(np.log(p.S_target_source.scale)), float(np.sqrt(evaluated.covariance[6, 6]))
     return {
-        "log_nfa": p.log_nfa,
-        "runner_up": p.runner_up,
+        "log_nfa": stated.log_nfa,
+        "runner_up": stated.runner_up,
         "free_space_violation": e.free_space_violation,
         "num_seen": float(e.num_seen),
         "num_judged": float(e.num_judged),

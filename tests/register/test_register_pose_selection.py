@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsmap.register import pose_selection
+from gsmap.register import pair, pose_selection
 from gsmap.register.evidence import PoseEvidence
 from gsmap.register.params import Params
 from gsmap.register.pose_selection import EvaluatedPose, is_same_pose, select_pose
+from gsmap.register.timing import Stopwatch
 from gsmap.register.unit_scale import ScaleDecision
 from gsmap.types import Sim3
 from gsmap.types.registration import Proposal
@@ -197,3 +198,32 @@ def test_a_pose_is_told_from_its_repetitions_by_similarity_alone() -> None:
     none = replace(SURE, colour_correlation=0.0, colour_t=0.0)
     rival = replace(evaluated(shifted(3), "colours disagree", evidence=none), similarity=0.8)
     assert select(rival, replace(similar(0, 0.9), evidence=replace(SURE, colour_t=400.0))).status == "no_match"
+
+
+@pytest.mark.guards("answers")
+def test_a_pose_that_repeats_another_states_its_own_inliers(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = replace(evaluated(shifted(0)), similarity=0.4)
+    support = SimpleNamespace(count=lambda S: (int(S.translation[0]), -9.0))
+    first = replace(first, proposal=replace(first.proposal, support=support))
+    bare = SimpleNamespace(surface=lambda: None)
+    in_metres = SimpleNamespace(target=bare, source=bare, to_metres=lambda S: S, to_scene_units=lambda S: S)
+    monkeypatch.setattr(pair, "MetricPair", SimpleNamespace(of=lambda *a: in_metres))
+    monkeypatch.setattr(pair, "own_working_m", lambda view: 1.0)
+    similarities = {0.0: 0.4, 3.0: 1.4}
+    repetition = SimpleNamespace(
+        elsewhere=lambda: [(shifted(3), 1.4)], similarity=lambda S: similarities[S.translation[0]]
+    )
+    monkeypatch.setattr(pair, "Repetition", lambda *a: repetition)
+    target = SimpleNamespace(graph=SimpleNamespace(up=np.array([0, 0, 1.0])))
+    for flaw, inliers, log_nfa in (("", 3, -9.0), ("improbable", 80, -60.0)):
+        monkeypatch.setattr(pair, "_evaluate", lambda p, *a, flaw=flaw: EvaluatedPose(p, SURE, COVARIANCE, flaw))
+        poses, _ = pair._compare_elsewhere([replace(first, flaw=flaw)], target, SCENE, Params(), Stopwatch())
+        found = select(*poses)
+        assert found.status == ("rejected" if flaw else "accepted")
+        assert (found.num_inliers, found.evidence["log_nfa"]) == (inliers, log_nfa)
+        assert np.isnan(found.evidence["runner_up"]) == (not flaw)
+    uncounted = replace(first, proposal=replace(first.proposal, support=None))
+    monkeypatch.setattr(pair, "_evaluate", lambda p, *a: EvaluatedPose(p, SURE, COVARIANCE, ""))
+    found = select(*pair._compare_elsewhere([uncounted], target, SCENE, Params(), Stopwatch())[0])
+    assert found.num_inliers == 0
+    assert np.isnan(found.evidence["log_nfa"])
