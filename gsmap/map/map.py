@@ -154,7 +154,10 @@ class Map(AbstractContextManager["Map"]):
         self.close()
 
     def __repr__(self) -> str:
-        names = [scene.name for scene in self.scenes()]
+        try:
+            names = [scene.name for scene in self.scenes()]
+        except StoreError as error:
+            return f"Map({self.store.location!r}, {error})"
         shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
         return f"Map({self.store.location!r}, {len(names)} scenes{': ' if names else ''}{shown})"
 
@@ -183,6 +186,7 @@ class Map(AbstractContextManager["Map"]):
         return self.store.scenes.get(ref)
 
     def close(self) -> None:
+        """Close the map. From then on, methods that read or write it raise `StoreError`; `settings` can be read."""
         self._workers.close()  # first: they have the map open
         self.store.close()
 

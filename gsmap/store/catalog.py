@@ -47,11 +47,22 @@ class Catalog:
             read_only_message
             or f"{display_name(folder)} is open for reading only (read-only disk, missing permission, or mode 'r')"
         )
-        self.engine = engine
+        self._engine: Engine | None = engine
         self.writable = writable
         self.patience_s = patience_s
         self._thread = threading.local()
         self._folder_id = _id_of(folder)
+
+    @property
+    def engine(self) -> Engine:
+        """The engine of its database, by which everything is read and written.
+
+        Raises:
+            StoreError: the catalog was closed.
+        """
+        if self._engine is None:
+            raise StoreError(f"{display_name(self.folder)} was closed: open it again", code="map_closed")
+        return self._engine
 
     @property
     def is_sqlite(self) -> bool:
@@ -337,17 +348,20 @@ class Catalog:
         Args:
             fold: checkpoint the log; False if the map turned out to be damaged.
         """
-        if not self.is_sqlite:
-            self.engine.dispose()
+        if self._engine is None:
             return
         file = self.folder / sqlite.FILE
         try:
-            if self.writable and fold and _id_of(self.folder) == self._folder_id:
+            if self.is_sqlite and self.writable and fold and _id_of(self.folder) == self._folder_id:
                 with contextlib.suppress(BusyError), self.lock(patience_s=0.0):
                     self._fold(at_bytes=1)
                     sqlite.dispose(self.engine, file, tidy=True)
         finally:
-            sqlite.dispose(self.engine, file, tidy=False)
+            if self.is_sqlite:
+                sqlite.dispose(self.engine, file, tidy=False)
+            else:
+                self.engine.dispose()
+            self._engine = None
 
     def _fold(self, at_bytes: int) -> None:
         """Checkpoint the log, holding the lock. A failure loses nothing, since committed data stays in the log."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -235,6 +236,29 @@ def test_the_up_of_a_graph_that_does_not_know_it_is_not_taken_from_an_older_one(
     graph = SceneGraph(scene.id, _graph(scene.id).layers, None, 1.0)
     site.store.graphs.save(graph, graph_keys(site.store, [scene], site.settings)[scene.id])
     assert set(pose_inputs(site.store, site.settings).ups) == {other.id for other in site.scenes()[1:]}
+
+
+def test_a_closed_map_answers_nothing_from_memory(site: Map, tried: list[tuple[str, str]]) -> None:
+    site.update()
+    doors = ("add_edge", "confirm", "edge_rows", "edit", "metres", "optimize", "poses", "prune", "read", "remove")
+    doors += ("revision_rows", "scene_rows", "scenes", "show_pair", "show_scene", "status", "tag", "update", "why")
+    given = {"ref": "hall", "pair": "hall:stairs", "what": "hall:stairs", "name": "n", "note": "n"}
+    given |= {"S_target_source": Sim3.identity(), "sigmas": np.ones(7)}
+
+    def call(door: str) -> object:
+        wanted = inspect.signature(getattr(site, door)).parameters.values()
+        return getattr(site, door)(**{p.name: given[p.name] for p in wanted if p.default is p.empty and p.kind == 1})
+
+    for door in ("edge_rows", "scenes", "status", "show_scene", "why"):
+        assert call(door)
+    site.close()
+    site.close()
+    for door in doors:
+        with raises(StoreError, code="map_closed"):
+            call(door)
+    with raises(StoreError, code="map_closed"):
+        site["hall"]
+    assert "closed" in repr(site)
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,7 @@ ERRORS: Final[Mapping[str, str]] = {
     "not_a_folder": "A file was found in place of a folder.",
     "not_a_plain_file": "A link, pipe, device or folder was found in place of a plain file.",
     "not_json": "A file is not valid JSON, or not of the structure expected.",
+    "map_closed": "The map was closed by the program that had opened it.",
     "not_writable": "The file, folder, tag or map opened for reading cannot be written.",
     "own_export": "A file was exported from scenes of the map that it was given to.",
     "target_is_a_folder": "The output must be a file, but it is a folder.",
