@@ -8,7 +8,7 @@ as before.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from gsmap.formats.quantise import from_smallest_three, logits_of_bytes, opacity
 from gsmap.geometry.boxes import box_around
 from gsmap.store.layout import CHUNK_ROWS, Shape
 from gsmap.types import Gaussians
+from gsmap.types.gaussians import FIELDS
 
 _SQRT2 = np.sqrt(2.0)
 _LEVELS_16, _LEVELS_10, _LEVELS_8 = 65535.0, 1023.0, 255.0
@@ -26,6 +27,7 @@ _COLOUR_STEP = 0.02  # 0.006 of a colour in [0, 1]
 _GLOSS_STEP = 0.06  # of the view-dependent coefficients
 _NOT_FINITE = "a thinned scene has numbers that are not finite: ingest its capture again"
 _VALUES = ("log_scales", "sh0", "sh_rest")
+_PARTS = {"logit_opacities": ("opacities",), "sh": ("sh0", "sh_rest")}
 
 
 def pack(gaussians: Gaussians) -> dict[str, np.ndarray]:
@@ -64,32 +66,59 @@ def pack(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 
 def unpack(arrays: Mapping[str, np.ndarray], rows: np.ndarray) -> Gaussians:
-    """Return the Gaussians that compact arrays store.
+    """Return the Gaussians that compact arrays store, as `unpack_fields`."""
+    return Gaussians(**unpack_fields(arrays, rows, FIELDS))
+
+
+def unpack_fields(arrays: Mapping[str, np.ndarray], rows: np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return fields of the Gaussians (or ``sh0``) that compact arrays store.
 
     Args:
-        arrays: arrays of `pack`: boxes and ranges whole, of the others the rows that were read.
+        arrays: arrays of `arrays_of`: boxes and ranges whole, of the others the rows that were read.
         rows: (N,) numbers of the rows that were read.
 
     Raises:
         CorruptError: values that `pack` does not write.
     """
-    boxes = arrays["compact.boxes"]
-    ranges = {name: arrays[f"compact.{name}_range"] for name in _VALUES}
-    if not all(np.isfinite(a).all() for a in (boxes, *ranges.values())):
-        raise CorruptError(_NOT_FINITE, code="not_finite")
-    chunk = rows // CHUNK_ROWS
+
+    def finite(values: np.ndarray) -> np.ndarray:
+        if not np.isfinite(values).all():
+            raise CorruptError(_NOT_FINITE, code="not_finite")
+        return values
+
+    def values(name: str) -> np.ndarray:
+        low, step = finite(arrays[f"compact.{name}_range"])
+        return finite((low + arrays[f"compact.{name}"] * step).astype(np.float32))
+
+    def means() -> np.ndarray:
+        boxes, chunk = finite(arrays["compact.boxes"]), rows // CHUNK_ROWS
+        size = (boxes[:, 1] - boxes[:, 0])[chunk]
+        found = boxes[chunk, 0] + _join_bytes(arrays["compact.means"]) / _LEVELS_16 * size
+        return finite(found.astype(np.float32))
+
+    def quats() -> np.ndarray:
+        packed = arrays["compact.quats"]
+        three = np.stack([packed >> 20, packed >> 10, packed], axis=1) & 1023
+        return from_smallest_three(packed >> 30, (three / _LEVELS_10 - 0.5) * _SQRT2).astype(np.float32)
+
+    made: Mapping[str, Callable[[], np.ndarray]] = {
+        "means": means,
+        "quats": quats,
+        "log_scales": lambda: values("log_scales"),
+        "logit_opacities": lambda: logits_of_bytes(arrays["compact.opacities"]).astype(np.float32),
+        "sh0": lambda: values("sh0").reshape(len(rows), 1, 3),
+        "sh": lambda: np.concatenate([values("sh0"), values("sh_rest")], axis=1).reshape(len(rows), -1, 3),
+    }
     with np.errstate(over="ignore", invalid="ignore"):
-        size = boxes[:, 1] - boxes[:, 0]
-        means = boxes[chunk, 0] + _join_bytes(arrays["compact.means"]) / _LEVELS_16 * size[chunk]
-        value = {name: low + arrays[f"compact.{name}"] * step for name, (low, step) in ranges.items()}
-        found = [array.astype(np.float32) for array in (means, *value.values())]
-    if not all(np.isfinite(array).all() for array in found):
-        raise CorruptError(_NOT_FINITE, code="not_finite")
-    packed = arrays["compact.quats"]
-    three = np.stack([packed >> 20, packed >> 10, packed], axis=1) & 1023
-    quats = from_smallest_three(packed >> 30, (three / _LEVELS_10 - 0.5) * _SQRT2)
-    sh = np.concatenate([value["sh0"], value["sh_rest"]], axis=1).reshape(len(rows), -1, 3)
-    return Gaussians(means, quats, value["log_scales"], logits_of_bytes(arrays["compact.opacities"]), sh)
+        return {name: made[name]() for name in names}
+
+
+def arrays_of(names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the names of the arrays that hold some fields of Gaussians (or ``sh0``): those read by rows, and those
+    always read whole."""
+    by_row = [f"compact.{part}" for name in names for part in _PARTS.get(name, (name,))]
+    whole = ["compact.boxes"] if "means" in names else []
+    return by_row, whole + [f"{name}_range" for name in by_row if name.removeprefix("compact.") in _VALUES]
 
 
 def round_trip(gaussians: Gaussians) -> Gaussians:
@@ -140,10 +169,6 @@ def kept_shape(num_whole: int) -> Shape:
 def unpack_kept(bits: np.ndarray, num_whole: int) -> np.ndarray:
     """Return the rows (n,) int64 of the whole capture that are kept, ascending."""
     return np.flatnonzero(np.unpackbits(bits, count=num_whole))
-
-
-WHOLE: Sequence[str] = ("compact.boxes", *(f"compact.{name}_range" for name in _VALUES))
-"""Names of arrays that are always read as a whole."""
 
 
 def _split_bytes(values: np.ndarray) -> np.ndarray:

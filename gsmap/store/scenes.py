@@ -338,13 +338,9 @@ class Scenes:
             row = find(connection, ref)
             files = _manifest(connection, row)
             chunks = chunks_touching(connection, row.number, bounds)
-        if row.thinned is not None:
-            out = self.gaussians(row.id, bounds, without)
-            return out[inside(out.means, bounds)]
         spans = row_ranges(chunks, row.num_gaussians)
-        read = partial(self._arrays.read, KIND, row.group_id, files, shapes=shapes_of(row))
         with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
-            means = read(only=("means",), rows=spans)["means"]
+            means = self._fields(row, files, ["means"], spans)["means"]
             within = inside(means, bounds)
             if without is not None:
                 within &= ~_rows_of(without, spans)
@@ -372,9 +368,6 @@ class Scenes:
                 return self._read(row, files, [(start, stop)])
 
         def column(name: str, start: int, stop: int) -> np.ndarray:
-            if row.thinned is not None:
-                values: np.ndarray = getattr(read(start, stop), name)
-                return values
             with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
                 return self._fields(row, files, [name], [(start, stop)])[name]
 
@@ -398,12 +391,7 @@ class Scenes:
 
         def read(fields: Sequence[str], start: int, stop: int, out: Gaussians) -> None:
             with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
-                if row.thinned is None:
-                    self._fields(row, files, fields, [(start, stop)], out)
-                    return
-                found = self._read(row, files, [(start, stop)])
-            for name in fields:
-                getattr(out, name)[:] = getattr(found, name)
+                self._fields(row, files, fields, [(start, stop)], out)
 
         return ChunkSource(row.num_gaussians, row.sh_degree, boxes, CHUNK_ROWS, read)
 
@@ -411,15 +399,7 @@ class Scenes:
         self, row: Row[Any], files: tuple[StoredFile, ...], ranges: Sequence[tuple[int, int]] | None
     ) -> Gaussians:
         """Read the Gaussians in ranges of rows, or all Gaussians."""
-        shapes = shapes_of(row)
-        if row.thinned is None:
-            return Gaussians(**self._fields(row, files, FIELDS, ranges))
-        by_row = [name for name in compact.shapes(0, 0) if name not in compact.WHOLE]
-        read = self._arrays.read(KIND, row.group_id, files, only=by_row, rows=ranges, shapes=shapes)
-        read |= self._arrays.read(KIND, row.group_id, files, only=compact.WHOLE, shapes=shapes)
-        spans = [(0, row.num_gaussians)] if ranges is None else ranges
-        rows = np.concatenate([np.arange(*span) for span in spans]) if spans else np.zeros(0, dtype=np.int64)
-        return compact.unpack(read, rows)
+        return Gaussians(**self._fields(row, files, FIELDS, ranges))
 
     def _fields(
         self,
@@ -429,9 +409,14 @@ class Scenes:
         ranges: Sequence[tuple[int, int]] | None = None,
         out: Gaussians | None = None,
     ) -> dict[str, np.ndarray]:
-        """Read fields of the Gaussians (or ``sh0``) of a scene that is not thinned; into ``out`` if it is given."""
-        only, optional = stored_names(names)
+        """Read fields of the Gaussians (or ``sh0``) of a scene; into ``out`` if it is given."""
         whole = [(0, row.num_gaussians)] if ranges is None else ranges
+        if row.thinned is not None:
+            found = self._compact_fields(row, files, names, whole)
+            for name in names if out is not None else ():
+                getattr(out, name)[:] = found[name]
+            return found
+        only, optional = stored_names(names)
         count = sum(max(0, min(stop, row.num_gaussians) - start) for start, stop in whole)
         together: np.ndarray | None = None
 
@@ -461,6 +446,15 @@ class Scenes:
                 f"scene {row.name!r} has no array {error}: run gsmap check, and ingest it again", code="arrays_corrupt"
             ) from error
 
+    def _compact_fields(
+        self, row: Row[Any], files: tuple[StoredFile, ...], names: Sequence[str], ranges: Sequence[tuple[int, int]]
+    ) -> dict[str, np.ndarray]:
+        by_row, whole = compact.arrays_of(names)
+        read = partial(self._arrays.read, KIND, row.group_id, files, shapes=shapes_of(row))
+        arrays = read(only=by_row, rows=ranges) | (read(only=whole) if whole else {})
+        rows = np.concatenate([np.zeros(0, np.int64), *(np.arange(*span) for span in ranges)])
+        return compact.unpack_fields(arrays, rows, names)
+
     def unread(self, ref: str) -> Gaussians:
         """Return a scene's Gaussians (Morton order), of which only the fields that are used are read.
 
@@ -470,8 +464,6 @@ class Scenes:
         with self._catalog.read() as connection:
             row = find(connection, ref)
             files = _manifest(connection, row)
-        if row.thinned is not None:
-            return self.gaussians(row.id)
 
         def read(names: Sequence[str]) -> dict[str, np.ndarray]:
             with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):

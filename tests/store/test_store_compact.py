@@ -15,6 +15,7 @@ from gsmap.store import Store, compact, purging
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.merging import merge
 from gsmap.types import Gaussians, SceneGraph, Segments
+from gsmap.types.gaussians import FIELDS
 
 
 def sorted_gaussians(n=500, degree=1, seed=0) -> Gaussians:
@@ -68,7 +69,32 @@ def test_a_thinned_scene_reads_whole_and_in_pieces(store):
     reach = 3 * after.scales.max(1, keepdims=True)
     wanted = ((after.means >= box[0] - reach) & (after.means <= box[1] + reach)).all(1)
     np.testing.assert_array_equal(store.scenes.gaussians("a", box).means, after.means[wanted])
+    within = ((after.means >= box[0]) & (after.means <= box[1])).all(1)
+    np.testing.assert_array_equal(store.scenes.gaussians_within("a", box).quats, after.quats[within])
+    np.testing.assert_array_equal(store.scenes.unread("a").sh, after.sh)
     assert store.check().ok
+
+
+def test_each_array_of_a_thinned_scene_is_read_for_its_fields_alone(store, monkeypatch):
+    g = make_gaussians(2 * CHUNK_ROWS)
+    store.scenes.add(g, make_cameras(), name="a")
+    store.scenes.thin("a", np.arange(len(g)) % 4 > 0)
+    after, source, rows = store.scenes.gaussians("a"), store.scenes.chunks("a"), slice(100, CHUNK_ROWS + 100)
+    names, read = [], store.scenes._arrays.read
+
+    def recorded(*args, only, **kwargs):
+        names.extend(only)
+        return read(*args, only=only, **kwargs)
+
+    monkeypatch.setattr(store.scenes._arrays, "read", recorded)
+    found = Gaussians(*(np.zeros_like(getattr(after[rows], name)) for name in FIELDS))
+    source.read(FIELDS[:-1], rows.start, rows.stop, found)
+    source.read(FIELDS[-1:], rows.start, rows.stop, found)
+    assert sorted(names) == sorted(compact.shapes(0, 0))
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(found, name), getattr(after[rows], name))
+    columns = np.concatenate(list(store.scenes.source("a").columns("sh0")))
+    np.testing.assert_array_equal(columns, after.sh[:, :1])
 
 
 def test_thinning_frees_what_was_there_but_not_what_a_tag_names(store):
