@@ -7,12 +7,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-_KEPT = (0.02, 0.98)  # quantiles of the points that a footprint contains, without floaters
+_STEP_M, _STEP_SPACINGS = 0.25, 4  # largest gap in a surface: in metres or, of few points, in their mean distance
+_MIDDLE = (0.02, 0.98)  # quantiles of the points whose mean distance is taken
 _YAWS_DEG = np.arange(0.0, 90.0, 1.0)
 _MARGIN = 0.05  # margin as a fraction of the longer side
 _LEAST_M = 1e-3
 _CELLS = 90  # grid cells of outlines along the longer side
 _REACH = 3  # corners on either side over which an outline is smoothed
+_MOST_STEPS = 1 << 29  # from the middle; farther floaters are taken nearer
 _FEW = 50  # number of points below which an outline is their convex hull
 # Smallest part, as a fraction of the largest part, and smallest hole, as a fraction of the footprint.
 _LEAST_PART, _LEAST_HOLE = 0.1, 0.03
@@ -99,7 +101,7 @@ def make_plan(
     """
     level = _level(np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, np.float64))
     every = [np.concatenate([one.points, one.track, one.middle[None]]) for one in shown]
-    flat = [_inner(points @ level.T) for points in every]
+    flat = [_surface(points @ level.T, _STEP_M / metres_per_unit) for points in every]
     if not flat or not all(np.isfinite(points).all() for points in flat):
         return None
     R = _turned(level, np.concatenate([points[:, :2] for points in flat]))
@@ -108,7 +110,7 @@ def make_plan(
         found: np.ndarray = (points @ R.T)[:, :2] * metres_per_unit
         return found
 
-    shapes = [_inner(place(one.points)) for one in shown]
+    shapes = [_surface(place(one.points), _STEP_M) for one in shown]
     cell = max(float(np.ptp(np.concatenate(shapes), axis=0).max()) / _CELLS, _LEAST_M)
     footprints = tuple(_outlines(points, cell) for points in shapes)
     tracks, middles = tuple(place(one.track) for one in shown), place(np.array([one.middle for one in shown]))
@@ -157,13 +159,33 @@ def _turn(angle: float) -> np.ndarray:
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
 
 
-def _inner(points: np.ndarray) -> np.ndarray:
-    """Drop the outermost points on each axis; return a small number of points unchanged."""
-    if len(points) < 50:
+def _surface(points: np.ndarray, step: float) -> np.ndarray:
+    """Drop floaters: points (N, 2 or 3) outside the large connected parts of the ground that points lie on.
+
+    A share of the points would not do: much of the ground may have few of them.
+
+    Args:
+        step: largest gap in a surface.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    if len(points) < _FEW or not np.isfinite(points).all():
         return points
-    low, high = np.quantile(points[:, :2], _KEPT, axis=0)
-    inside = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(1)
-    return points[inside] if inside.sum() > 3 else points
+    low, high = np.quantile(points[:, :2], _MIDDLE, axis=0)
+    step = max(step, _STEP_SPACINGS * float(np.sqrt((high - low).prod() / len(points))))
+    at = np.clip((points[:, :2] - low) / step, -_MOST_STEPS, _MOST_STEPS).astype(np.int64)
+    cells, of = np.unique(at @ [4 * _MOST_STEPS, 1], return_inverse=True)
+    pairs = []
+    for ahead in (1, 4 * _MOST_STEPS - 1, 4 * _MOST_STEPS, 4 * _MOST_STEPS + 1):
+        other = np.minimum(np.searchsorted(cells, cells + ahead), len(cells) - 1)
+        pairs.append(np.stack([np.arange(len(cells)), other])[:, cells[other] == cells + ahead])
+    one, two = np.concatenate(pairs, axis=1)
+    links = coo_matrix((np.ones(len(one), bool), (one, two)), shape=(len(cells),) * 2)
+    part = connected_components(links, directed=False)[1]
+    areas = np.bincount(part)
+    found: np.ndarray = points[(areas >= _LEAST_PART * areas.max())[part][of]]
+    return found
 
 
 def _outlines(points: np.ndarray, cell: float) -> tuple[np.ndarray, ...]:
