@@ -60,8 +60,9 @@ def empty_catalog(folder: Path, url: str | None = None, map_id: str = "") -> Cat
     return made
 
 
-def drop_tables(catalog: Catalog) -> None:
+def drop_tables(folder: Path, url: str) -> None:
     """Drop the tables of `empty_catalog` from a database whose map could not be made."""
+    catalog = Catalog(folder, _catalog.url_engine(url), writable=True)
     try:
         migrate.upgrade(catalog, "base")
         with translate_errors(catalog.folder), catalog.engine.begin() as connection:
@@ -72,6 +73,8 @@ def drop_tables(catalog: Catalog) -> None:
             catalog.engine.url,
             error,
         )
+    finally:
+        catalog.close()
 
 
 def _require_utf8(engine: Engine) -> None:

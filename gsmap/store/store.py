@@ -483,5 +483,4 @@ def _make_catalog(folder: Path, url: str | None, undo: contextlib.ExitStack) -> 
         row = {"id": map_id, "created_at": _catalog.now(), "gsmap_version": __version__}
         connection.execute(insert(schema.about), row)
     if url is not None:
-        undo.callback(made.close)
-        undo.callback(drop_tables, made)
+        undo.callback(drop_tables, folder, url)

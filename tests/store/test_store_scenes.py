@@ -166,7 +166,7 @@ def test_what_lies_within_bounds_is_read_and_of_chunks_without_any_only_means(st
     monkeypatch.setattr(store.arrays, "read", lambda *a, **k: asked.append(k) or real(*a, **k))
     beside = np.array([[-99.0, -99, -99], [whole.means[:, 0].min() - 1e-6, 99, 99]])
     assert len(store.scenes.gaussians_within("a", beside)) == 0 < len(store.scenes.gaussians("a", beside))
-    assert asked[0]["only"] == ("means",)
+    assert asked[0]["only"] == ["means"]
     assert asked[0]["rows"]
     assert asked[1]["rows"] == []
     store.scenes.thin("a", np.ones(len(g), bool))

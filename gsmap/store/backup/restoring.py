@@ -255,13 +255,13 @@ def _move_catalog(folder: Path, url: str, undo: contextlib.ExitStack) -> MapStat
         with own.read() as connection:
             map_id = connection.execute(select(schema.about.c.id)).scalar_one()
         there = empty_catalog(folder, url, map_id)
-        undo.callback(drop_tables, there)
+        undo.callback(drop_tables, folder, url)
         with translate_errors(folder):
             copy_catalog(own, there, leave_out=("leases",))
     state = read_state(folder / sqlite.FILE)
     for left in folder.glob(f"{sqlite.FILE}*"):
         left.unlink()
-    there.engine.dispose()
+    there.close()
     return state
 
 

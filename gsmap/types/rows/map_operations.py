@@ -93,6 +93,7 @@ class MergeReport(CopyReport):
         "num_known": "known",
         "num_graphs": "graphs",
         "num_registrations": "registrations",
+        "num_reviews": "reviews",
         "num_facts": "facts",
         "num_revisions": "revisions",
         "num_bytes": "bytes",
