@@ -1,6 +1,7 @@
 """Captures that are stretched along one axis, or bent: how many accepted pairs say so, and how well they measure it.
 
     python -m tools.bench.deform --made 21 22 23 24 [--bend] [--percent 0 1 2 3 4] [--captures FOLDER --pairs c0:c1 ...]
+    python -m tools.bench.deform --rigid 8201 8202 8203
 
 Every place is captured twice. The second capture is ingested as it is and deformed by each percentage, with its
 cameras, and each is registered with the first one: stretched along an axis of its frame drawn at random, or, with
@@ -8,10 +9,14 @@ cameras, and each is registered with the first one: stretched along an axis of i
 drawn at random). ``--captures`` takes pairs of a folder of captures (NAME.ply, NAME.cameras.json) besides. One row for
 each percentage: pairs, accepted ones, accepted ones that say that they are stretched or bent (all but the first row
 should), and the largest error of a named stretch.
+
+``--rigid`` counts undeformed pairs that are named as bent or stretched: places of these seeds are captured eight times
+(0, 40 or 80 steps of training, two routes, varied exposure), and all pairs are tested under their true poses.
 """
 
 from __future__ import annotations
 
+import itertools
 import re
 import tempfile
 from dataclasses import replace
@@ -23,8 +28,13 @@ import gsmap.map
 from gsmap import formats
 from gsmap.geometry.warps import deform_gaussians
 from gsmap.map import Map
-from gsmap.types import Cameras, Gaussians
-from gsmap_synthetic import make_captures, write_captures
+from gsmap.register.deformation import fit_deformation
+from gsmap.register.prepare import prepare
+from gsmap.register.surface import Surface
+from gsmap.register.view_cache import PreparedViews
+from gsmap.types import Cameras, Gaussians, Sim3
+from gsmap_synthetic import make_captures, make_place, write_captures
+from gsmap_synthetic.capture import default_routes
 from tools.bench.change_scores import claims_of, score_changes
 from tools.harness import argument_parser, print_table, say
 from tools.make.change_truth import Truth
@@ -38,6 +48,7 @@ Capture = tuple[Gaussians, Cameras]
 def main() -> None:
     parser = argument_parser(__doc__)
     parser.add_argument("--changes", type=Path, nargs="+", help="folders of tools/make/change.py")
+    parser.add_argument("--rigid", type=int, nargs="+", help="seeds of places whose undeformed pairs are tested")
     parser.add_argument("--made", type=int, nargs="*", default=[21, 22, 23, 24], help="seeds of places")
     parser.add_argument("--bend", action="store_true", help="bend the captures instead of stretching them")
     parser.add_argument("--percent", type=float, nargs="+", default=[0, 1, 2, 3, 4])
@@ -47,6 +58,10 @@ def main() -> None:
     rng = np.random.default_rng(0)
     if given.changes:
         _print_changes(given.changes, given.percent, bend=given.bend)
+        return
+    if given.rigid:
+        rows = [_count_rigid(seed) for seed in given.rigid]
+        print_table(["place", "pairs tested", "named"], [*rows, ("all", *np.sum(rows, axis=0)[1:].tolist())])
         return
     counts = {percent: [0, 0, 0, 0, 0.0] for percent in given.percent}
     with tempfile.TemporaryDirectory(prefix="gsmap-deform-") as folder:
@@ -69,6 +84,38 @@ def _pairs(seeds: list[int], captures: Path | None, pairs: list[str], folder: Pa
         yield f"place {seed}", *(_read(place, path.stem) for path in write_captures(place, made))
     for pair in pairs:
         yield pair.replace(":", "-"), *(_read(captures, name) for name in pair.split(":"))
+
+
+def _count_rigid(seed: int) -> tuple[int, int, int]:
+    """Return the seed of a place, the number of pairs of its captures that are tested, and of those that are named."""
+    rng = np.random.default_rng(seed)
+    place = make_place(seed, texel_m=0.012)
+    routes = default_routes(place, 2)
+    surfaces, poses = [], []
+    for k in range(8):
+        (made,) = make_captures(
+            *(seed, 1),
+            steps=(0, 40, 80)[k % 3],
+            num_frames=34,
+            num_gaussians=int(rng.integers(18_000, 34_000)),
+            size_px=(200, 150),
+            place=place,
+            routes=[routes[k % 2]],
+            vary_exposure=True,
+            first=k,
+        )
+        prepared = prepare(made.name, made.gaussians.degree_0(), made.cameras, 1.0)
+        splats = made.gaussians.degree_0(prepared.is_surface)
+        views = PreparedViews(prepared) if len(prepared.cameras) else None
+        surfaces.append(Surface.from_splats(splats, 1.0, made.gaussians, made.cameras, views, prepared))
+        poses.append(Sim3.from_matrix(np.array(made.T_scene_world)))
+    fits = [
+        fit_deformation(surfaces[i], surfaces[j], poses[i] @ poses[j].inverse())
+        for i, j in itertools.combinations(range(8), 2)
+    ]
+    named = [fit.is_bent or fit.is_stretched for fit in fits if fit is not None]
+    say(f"place {seed}: {sum(named)} of {len(named)} named")
+    return seed, len(named), sum(named)
 
 
 def _print_changes(places: list[Path], percents: list[float], *, bend: bool) -> None:
