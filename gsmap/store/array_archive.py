@@ -26,7 +26,9 @@ FILE = "arrays.zip"
 TAIL_BYTES = 64 << 10
 """Number of bytes read first, from the end: enough for the table and metadata of a scene with two million Gaussians."""
 
-_ZSTD_LEVEL = 1
+_ZSTD_LEVEL, _FLOAT_LEVEL = 1, -1
+"""Levels of zstd. Below 0 it copies what finds no match, such as mantissas, instead of coding it by its entropy: float32
+arrays are a tenth larger, and read four times as fast."""
 _FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # equal arrays give equal bytes, whenever they are written
 _END, _END_64, _LOCATOR = struct.Struct("<4s4H2LH"), struct.Struct("<4sQ2H2L4Q"), struct.Struct("<4sLQL")
 _ENTRY, _LOCAL = struct.Struct("<4s6H3L5H2L"), struct.Struct("<4s5H3L2H")
@@ -81,13 +83,14 @@ def write(path: Path, arrays: Mapping[str, np.ndarray | StreamedArray], *, chunk
 
     keys: dict[str, Any] = {}
     group = zarr.create_group(MemoryStore(keys), zarr_format=3)
+    levels = {name: _FLOAT_LEVEL if array.dtype == np.float32 else _ZSTD_LEVEL for name, array in arrays.items()}
     for name, array in arrays.items():
         group.create_array(
             name,
             shape=array.shape,
             dtype=array.dtype,
             chunks=(min(chunk_rows, max(1, len(array))), *(max(1, n) for n in array.shape[1:])),
-            compressors=[ZstdCodec(level=_ZSTD_LEVEL, checksum=True)],
+            compressors=[ZstdCodec(level=levels[name], checksum=True)],
             fill_value=0,
         )
     with zipfile.ZipFile(path, "x", zipfile.ZIP_STORED) as archive:
@@ -98,7 +101,7 @@ def write(path: Path, arrays: Mapping[str, np.ndarray | StreamedArray], *, chunk
                     if i * chunk_rows < len(array):
                         chunk = _chunk(array, i, min(chunk_rows, len(array)))
                         key = "/".join([name, "c", str(i), *("0" for _ in array.shape[1:])])
-                        archive.writestr(zipfile.ZipInfo(key, _FIXED_DATE), zstd.compress(chunk, _ZSTD_LEVEL, True))
+                        archive.writestr(zipfile.ZipInfo(key, _FIXED_DATE), zstd.compress(chunk, levels[name], True))
         for key, described in keys.items():
             archive.writestr(zipfile.ZipInfo(key, _FIXED_DATE), described.to_bytes())
 
