@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import hashlib
 import io
 import json
 import os
 import resource
 import shutil
+import weakref
 import zipfile
 from pathlib import Path
 
@@ -484,6 +486,20 @@ def test_segments_that_others_made_one_meanwhile_are_asked_anew(made, tmp_path) 
         found = localizer.localize(photo)
         assert np.array_equal(found.T_map_camera, report.results[0].T_map_camera)
         assert len(_segments(m.store)) == 1
+
+
+def test_arrays_are_freed_together_with_their_localizer(made) -> None:
+    folder, lens, _ = made
+    with gsmap.map.open(folder / "m.gsmap") as m:
+        localizer = Localizer(m.store, m.settings, lambda *told: None)
+        localizer.localize(read_photo(folder / "photo.png", Lens(tuple(float(x) for x in lens.split(",")))))
+        arrays = [weakref.ref(scene.chunked) for scene in localizer.placed.values()]
+        gc.disable()
+        try:
+            del localizer
+            assert [array() for array in arrays] == [None] * len(arrays)
+        finally:
+            gc.enable()
 
 
 def test_features_come_and_go_with_their_scene(made, world, tmp_path) -> None:

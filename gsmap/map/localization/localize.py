@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+import weakref
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
@@ -106,15 +107,16 @@ class Localizer:
         self.keys = feature_keys(store, list(self.scenes.values()), settings)
         self._held: dict[str, SceneFeatures] = {}
         ensure(store, list(self.scenes.values()), self.keys, settings, progress, self._held)
+        arrays = weakref.proxy(self)  # no cycle of references, so that the arrays are freed together with the localizer
         self.placed = {
             scene: MapScene(
                 scene,
                 in_metres(poses[scene].S_map_scene, self.metres.get(poses[scene].component, 1.0)),
                 poses[scene].component,
                 poses[scene].covariance,
-                partial(self._gaussians, scene),
-                partial(self._features, scene),
-                partial(self._chunks, scene),
+                partial(Localizer._gaussians, arrays, scene),
+                partial(Localizer._features, arrays, scene),
+                partial(Localizer._chunks, arrays, scene),
             )
             for scene in self.scenes
         }
