@@ -16,7 +16,6 @@ GREY = np.array([0.299, 0.587, 0.114], np.float32)
 
 _STRIDE_PX = 12  # spacing of the rows and columns at which the motion of a render is measured
 _MOTION_QUANTILE = 0.9
-_MAX_MOTION_WINDOWS = 0.25  # displacements are computed again if the content moves farther than this share of a window
 
 
 def downsample(image: np.ndarray, by: int) -> np.ndarray:
@@ -54,7 +53,6 @@ class SceneRender:
         T_metric_camera: (4, 4) camera-to-component, metres.
         intrinsics_px: (4,) intrinsics at this size.
         displacement: (R, C, 2) displacement map (`gsmap.localize.displacement`), or None.
-        displaced_at: the earlier render for whose camera the displacement map was computed; None for this one.
     """
 
     scene: str
@@ -66,7 +64,6 @@ class SceneRender:
     T_metric_camera: np.ndarray
     intrinsics_px: np.ndarray
     displacement: np.ndarray | None = None
-    displaced_at: SceneRender | None = None
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -143,34 +140,11 @@ def render_scenes(
             out.append(reused[one.scene])
             continue
         camera = one.camera(T_metric_camera, intrinsics_px, size_px)
-        rendered = one.render(camera)
+        rendered = one.render(camera, with_centres=with_displacement)
         rgb = np.clip(np.nan_to_num(rendered.colour[0]), 0, 1)
         depth = rendered.depth[0] * np.float32(one.S_metric_scene.scale)
         smooth = features.smooth_depth(rendered) > 0
-        moved, at = None, None
-        if with_displacement:
-            moved, at = _displacement_map(one, T_metric_camera, intrinsics_px, size_px, previous)
+        moved = displacement.displacement_map(rendered) if with_displacement else None
         alpha = rendered.alpha[0]
-        camera_of = T_metric_camera, intrinsics_px
-        out.append(SceneRender(one.scene, rgb, rgb @ GREY, alpha, depth, smooth, *camera_of, moved, at))
+        out.append(SceneRender(one.scene, rgb, rgb @ GREY, alpha, depth, smooth, T_metric_camera, intrinsics_px, moved))
     return out
-
-
-def _displacement_map(
-    scene: MapScene,
-    T_metric_camera: np.ndarray,
-    intrinsics_px: np.ndarray,
-    size_px: tuple[int, int],
-    previous: Sequence[SceneRender],
-) -> tuple[np.ndarray, SceneRender | None]:
-    """Return the displacement map of a render, or that of a previous render whose content moved little, and that one.
-
-    A map is a mean over windows, so that it hardly changes if the content moves by a fraction of their width.
-    """
-    for one in (render.displaced_at or render for render in previous):
-        if one.scene == scene.scene and one.displacement is not None:
-            larger = max(size_px) / max(one.size_px)
-            limit = _MAX_MOTION_WINDOWS * displacement.WINDOW_PX * max(one.size_px) / 480
-            if one.motion_px(T_metric_camera, intrinsics_px / larger) <= limit:
-                return one.displacement * np.float32(larger), one
-    return displacement.displacement_map(scene, T_metric_camera, intrinsics_px, size_px), None

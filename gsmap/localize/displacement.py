@@ -12,8 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmap.geometry.filters import box_means
-from gsmap.geometry.projection import project
-from gsmap.localize.map_scene import MapScene
+from gsmap.render import Rendering
 
 FRACTION = 0.16
 """Share of the distance from a pixel to the means of its Gaussians that remains after training
@@ -26,35 +25,25 @@ position."""
 WINDOW_PX = 36.0
 """Width of the square over which the displacement is averaged, for a render of 480 pixels."""
 
-RENDER_SIDE_PX = 120
-"""Longer side of the small render from which the displacement is computed."""
+GRID_SIDE = 120
+"""Number of cells along the longer side of a displacement map."""
 
 
-def displacement_map(
-    scene: MapScene,
-    T_metric_camera: np.ndarray,
-    intrinsics_px: np.ndarray,
-    size_px: tuple[int, int],
-    fraction: float | None = None,
-) -> np.ndarray:
+def displacement_map(rendered: Rendering, fraction: float | None = None) -> np.ndarray:
     """Return (R, C, 2) float32 displacements of a render's content (right and down, in pixels) on a coarser grid.
 
     Args:
-        intrinsics_px: (4,) intrinsics of the render at ``size_px``.
+        rendered: a render of one camera, with the positions of centres.
         fraction: used instead of `FRACTION`.
     """
-    longest = max(size_px)
-    by = max(1, round(longest / RENDER_SIDE_PX))
-    small = (size_px[0] // by, size_px[1] // by)
-    camera = scene.camera(T_metric_camera, intrinsics_px / by, small)
-    means, alpha = scene.render_positions(camera)
-    points = scene.S_metric_scene.apply(means.reshape(-1, 3).astype(np.float64))
-    at, depth = project(points, np.linalg.inv(T_metric_camera), intrinsics_px / by)
-    row, column = np.mgrid[0 : small[1], 0 : small[0]]
-    offset = (at - np.stack([column, row], axis=2).reshape(-1, 2) - 0.5) * by
-    offset[(depth <= 0) | (alpha.ravel() < 0.9)] = 0
+    alpha = rendered.alpha[0]
+    longest = max(alpha.shape)
+    by = max(1, round(longest / GRID_SIDE))
+    row, column = np.mgrid[0 : alpha.shape[0], 0 : alpha.shape[1]].astype(np.float32) + np.float32(0.5)
+    offset = rendered.centre[0] - np.stack([column, row], axis=2)
+    offset[alpha < 0.9] = 0
     limit = MAX_PX * longest / 480
-    width = 2 * round(WINDOW_PX * longest / 480 / by / 2) + 1
-    offset = np.clip(offset, -limit, limit).reshape(*alpha.shape, 2).astype(np.float32)
-    out: np.ndarray = np.float32(FRACTION if fraction is None else fraction) * box_means(offset, width)
+    width = 2 * round(WINDOW_PX * longest / 480 / 2) + 1
+    means = box_means(np.clip(offset, -limit, limit), width, first=by // 2, step=by)
+    out: np.ndarray = np.float32(FRACTION if fraction is None else fraction) * means
     return out

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from gsmap.render import Rendering, render
+from gsmap.render import Rendering
 from gsmap.render.chunked import ChunkedGaussians
 from gsmap.types import Cameras, Gaussians, Sim3
 from gsmap.types.localization import SceneFeatures
@@ -51,22 +51,10 @@ class MapScene:
             return ChunkedGaussians.of(self.gaussians)
         return ChunkedGaussians(self.read_chunks())
 
-    def render(self, camera: Cameras) -> Rendering:
-        """Render colour, alpha and depth of the scene from one camera in its frame."""
-        gaussians, index = self.chunked.seen_from(camera)
-        return render(gaussians, camera, dominant_id=False, index=index, backend="native")
-
-    def render_positions(self, camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
-        """Render the positions of the Gaussians from one camera in the scene's frame.
-
-        Returns:
-            (H, W, 3) positions in the scene's frame, valid where (H, W) alpha is large.
-        """
-        gaussians, index = self.chunked.coloured_by_position(camera)
-        rendered = render(gaussians, camera, depth=False, dominant_id=False, index=index, backend="native")
-        low, high = self.chunked.box
-        alpha = rendered.alpha[0]
-        return rendered.colour[0] / np.maximum(alpha, 1e-3)[..., None] * (high - low) + low, alpha
+    def render(self, camera: Cameras, *, with_centres: bool = False) -> Rendering:
+        """Render colour, alpha and depth of the scene from one camera in its frame, and with ``with_centres`` also
+        where the centres of the Gaussians lie."""
+        return self.chunked.render(camera, with_centres=with_centres)
 
     def drop(self) -> None:
         """Release the arrays."""

@@ -27,7 +27,7 @@ inline Scene scene_of(const Floats &means, const Floats &quats, const Floats &lo
 
 inline Image image_of(const Floats &background, const FloatsOut &colour, const std::optional<FloatsOut> &depth,
                       const FloatsOut &alpha) {
-    Image image{colour.data(), depth ? depth->data() : nullptr, alpha.data(), nullptr, nullptr, {}};
+    Image image{colour.data(), depth ? depth->data() : nullptr, alpha.data(), nullptr, nullptr, nullptr, {}};
     std::memcpy(image.background, background.data(), sizeof image.background);
     return image;
 }

@@ -54,12 +54,14 @@ void draw(View &view, const Floats &means, const Floats &quats, const Floats &lo
           const Floats &sh, const Doubles &pose, const Doubles &intrinsics, int width, int height, const Ranges &ranges,
           const Floats &depths, const Ranges &blocks, const Floats &background, const FloatsOut &colour,
           const std::optional<FloatsOut> &depth, const FloatsOut &alpha, const std::optional<Ints> &dominant_id,
-          const std::optional<FloatsOut> &max_weight) {
+          const std::optional<FloatsOut> &max_weight, const std::optional<FloatsOut> &centre) {
     const Camera camera = camera_of(pose, intrinsics, width, height);
     const Scene scene = scene_of(means, quats, log_scales, logits, sh);
     Image image = image_of(background, colour, depth, alpha);
     image.dominant_id = dominant_id ? dominant_id->data() : nullptr;
     image.max_weight = max_weight ? max_weight->data() : nullptr;
+    image.centre = centre ? centre->data() : nullptr;
+    if (centre && (!depth || dominant_id || max_weight)) throw std::invalid_argument("centres come with depths alone");
     const size_t n = depths.size();
     if (ranges.size() != 2 * n || blocks.size() != 4 * n) throw std::invalid_argument("candidates need rows, a depth, a box");
     std::vector<Candidates> candidates(n);
@@ -146,7 +148,7 @@ void bind_rasteriser(nb::module_ &m) {
         .def("draw", &draw, nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"), nb::arg("logit_opacities"),
              nb::arg("sh"), nb::arg("pose"), nb::arg("intrinsics"), nb::arg("width"), nb::arg("height"), nb::arg("ranges"),
              nb::arg("depths"), nb::arg("blocks"), nb::arg("background"), nb::arg("colour"), none("depth"), nb::arg("alpha"),
-             none("dominant_id"), none("max_weight"))
+             none("dominant_id"), none("max_weight"), none("centre"))
         .def("backward", &backward, nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"), nb::arg("logit_opacities"),
              nb::arg("sh"), nb::arg("background"), nb::arg("colour"), none("depth"), nb::arg("alpha"), none("g_colour"),
              none("g_depth"), none("g_alpha"), none("gradients"), none("g_pose"))

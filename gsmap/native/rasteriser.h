@@ -59,6 +59,7 @@ struct Image {  // any of them may be null, except alpha
     float *colour, *depth, *alpha;
     int32_t *dominant_id;
     float *max_weight;  // (n,) per Gaussian of the scene: largest blending weight, raised only
+    float *centre;      // (pixels, 2) mean position on the image of the Gaussians' centres, by blending weight
     float background[3];
     const float *looked_at;  // not 0 where a loss looks: blocks out of its reach (`kSsimReach`) stay empty; null: all
 };
@@ -78,7 +79,7 @@ struct TileWork {
 
 // A tile may be blended in several calls, of which the first starts and the last writes the image.
 enum BlendPart { kBlendOn = 0, kBlendStart = 1, kBlendEnd = 2 };
-constexpr size_t kBlendStateBytes = 36864;  // between two calls, aligned to 64
+constexpr size_t kBlendStateBytes = 45056;  // between two calls, aligned to 64
 
 // One attribute of N Gaussians under Adam: values, first and second moments, all (N, cols).
 struct AdamArrays {

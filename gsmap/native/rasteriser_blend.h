@@ -15,6 +15,7 @@ using BlendRound = RoundOf<kListed, kStrips>;
 // before its transmittance falls to 1e-4: `left` falls on, so that the next Gaussian need not wait for what was decided.
 struct alignas(64) BlendBlock {
     float left[kPixels], t[kPixels], r[kPixels], g[kPixels], b[kPixels], depth[kPixels], best[kPixels];
+    float x[kPixels], y[kPixels];  // of the centres, from the tile's first corner
     int32_t id[kPixels];
     INLINE bool is_open() const {
         M any_left{};
@@ -24,11 +25,11 @@ struct alignas(64) BlendBlock {
 };
 
 // Blends what is listed for a block, or for strip kStrip of it, into the vectors of a group that begins with `row`.
-template <bool kDepth, bool kId, bool kWeight, int kStrip>
+template <bool kDepth, bool kId, bool kWeight, bool kCentre, int kStrip>
 INLINE void blend_group(const BlendRound &round, BlendBlock &s, const Lanes &lanes, int b, int column, int row, V *most) {
     const uint32_t *ids = (const uint32_t *)round.field[ID];
     const Lanes first = lanes.in_tile(b, kStrips > 1 ? 0 : row);
-    V left[kGroup], t[kGroup], r[kGroup], g[kGroup], bl[kGroup], d[kGroup], best[kGroup];
+    V left[kGroup], t[kGroup], r[kGroup], g[kGroup], bl[kGroup], d[kGroup], best[kGroup], x[kGroup], y[kGroup];
     I id[kGroup];
     int at[kGroup];
     for (int v = 0; v < kGroup; v++) {
@@ -37,6 +38,7 @@ INLINE void blend_group(const BlendRound &round, BlendBlock &s, const Lanes &lan
         left[v] = load(&s.left[k * W]), t[v] = load(&s.t[k * W]);
         r[v] = load(&s.r[k * W]), g[v] = load(&s.g[k * W]), bl[v] = load(&s.b[k * W]);
         if (kDepth) d[v] = load(&s.depth[k * W]);
+        if (kCentre) x[v] = load(&s.x[k * W]), y[v] = load(&s.y[k * W]);
         if (kId) best[v] = load(&s.best[k * W]), id[v] = *(const I *)&s.id[k * W];
     }
     const int listed = b * kStrips + kStrip;
@@ -46,6 +48,7 @@ INLINE void blend_group(const BlendRound &round, BlendBlock &s, const Lanes &lan
         for (int v = 0; v < kStrip; v++) splat.next_row();
         const V cr = set1(round.field[R][j]), cg = set1(round.field[G][j]), cb = set1(round.field[B][j]);
         const V depth = kDepth ? set1(round.field[DEPTH][j]) : V{};
+        const V cx = kCentre ? set1(round.field[X][j]) : V{}, cy = kCentre ? set1(round.field[Y][j]) : V{};
         for (int v = 0; v < kGroup; v++) {
             const V exponent = splat.exponent(splat.u_at(column));
             splat.next_row();
@@ -59,6 +62,7 @@ INLINE void blend_group(const BlendRound &round, BlendBlock &s, const Lanes &lan
             g[v] = fma_where(drawn, weight, cg, g[v]);
             bl[v] = fma_where(drawn, weight, cb, bl[v]);
             if (kDepth) d[v] = fma_where(drawn, weight, depth, d[v]);
+            if (kCentre) x[v] = fma_where(drawn, weight, cx, x[v]), y[v] = fma_where(drawn, weight, cy, y[v]);
             t[v] = select(drawn, rest, t[v]);
             if (kId) {
                 const M more = gt(drawn, weight, best[v]);
@@ -73,22 +77,23 @@ INLINE void blend_group(const BlendRound &round, BlendBlock &s, const Lanes &lan
         store(&s.left[k * W], left[v]), store(&s.t[k * W], t[v]);
         store(&s.r[k * W], r[v]), store(&s.g[k * W], g[v]), store(&s.b[k * W], bl[v]);
         if (kDepth) store(&s.depth[k * W], d[v]);
+        if (kCentre) store(&s.x[k * W], x[v]), store(&s.y[k * W], y[v]);
         if (kId) store(&s.best[k * W], best[v]), *(I *)&s.id[k * W] = id[v];
     }
 }
 
 // All of one block's vectors; returns how many pairs of a Gaussian and a pixel were looked at.
-template <bool kDepth, bool kId, bool kWeight>
+template <bool kDepth, bool kId, bool kWeight, bool kCentre>
 INLINE int64_t blend_block(const BlendRound &round, BlendBlock &s, const Lanes &lanes, int b, V *most) {
     if constexpr (kStrips > 1) {
-        blend_group<kDepth, kId, kWeight, 0>(round, s, lanes, b, 0, 0, most);
-        blend_group<kDepth, kId, kWeight, 1>(round, s, lanes, b, 0, 1, most);
-        blend_group<kDepth, kId, kWeight, 2>(round, s, lanes, b, 0, 2, most);
-        blend_group<kDepth, kId, kWeight, 3>(round, s, lanes, b, 0, 3, most);
+        blend_group<kDepth, kId, kWeight, kCentre, 0>(round, s, lanes, b, 0, 0, most);
+        blend_group<kDepth, kId, kWeight, kCentre, 1>(round, s, lanes, b, 0, 1, most);
+        blend_group<kDepth, kId, kWeight, kCentre, 2>(round, s, lanes, b, 0, 2, most);
+        blend_group<kDepth, kId, kWeight, kCentre, 3>(round, s, lanes, b, 0, 3, most);
     } else {
         for (int row = 0; row < kBlockY / kRows; row += kGroup)
             for (int column = 0; column < kColumns; column++)
-                blend_group<kDepth, kId, kWeight, 0>(round, s, lanes, b, column, row, most);
+                blend_group<kDepth, kId, kWeight, kCentre, 0>(round, s, lanes, b, column, row, most);
     }
     int64_t pairs = 0;
     for (int k = 0; k < kStrips; k++) pairs += round.listed[b * kStrips + k] * int64_t(kPixels / kStrips);
@@ -127,7 +132,7 @@ INLINE void start_blend(const TileWork &work, const Image &image, const Lanes &l
         BlendBlock &s = state.block[b];
         for (int i = 0; i < kPixels; i++) {
             s.t[i] = 1.f, s.r[i] = s.g[i] = s.b[i] = 0.f;
-            s.depth[i] = s.best[i] = 0.f, s.id[i] = -1;
+            s.depth[i] = s.best[i] = s.x[i] = s.y[i] = 0.f, s.id[i] = -1;
         }
         M alive[kVectors];
         start_alive(work, lanes, b, alive);
@@ -136,7 +141,7 @@ INLINE void start_blend(const TileWork &work, const Image &image, const Lanes &l
     state.open = blocks_in_image(work, image.looked_at);
 }
 
-template <bool kDepth, bool kId, bool kWeight>
+template <bool kDepth, bool kId, bool kWeight, bool kCentre>
 INLINE int64_t go_on_blending(const TileWork &work, const Image &image, const Lanes &lanes, BlendState &state) {
     BlendRound round;
     V most[kWeight ? kListed + W : 1] = {};
@@ -149,7 +154,7 @@ INLINE int64_t go_on_blending(const TileWork &work, const Image &image, const La
         for (int b = 0; b < kBlocks; b++) {
             if (!(blocks >> b & 1)) continue;
             BlendBlock &s = state.block[b];
-            const int64_t looked = blend_block<kDepth, kId, kWeight>(round, s, lanes, b, most);
+            const int64_t looked = blend_block<kDepth, kId, kWeight, kCentre>(round, s, lanes, b, most);
             if (!looked) continue;
             pairs += looked;
             if (!s.is_open()) blocks &= ~(1u << b);
@@ -160,7 +165,7 @@ INLINE int64_t go_on_blending(const TileWork &work, const Image &image, const La
     return pairs;
 }
 
-template <bool kDepth, bool kId> INLINE void end_blend(const TileWork &work, const Image &image, const BlendState &state) {
+template <bool kDepth, bool kId, bool kCentre> INLINE void end_blend(const TileWork &work, const Image &image, const BlendState &state) {
     for_pixels(work, [&](int b, int i, int64_t p) {
         const BlendBlock &s = state.block[b];
         const float t = s.t[i], alpha = 1.f - t;
@@ -172,22 +177,26 @@ template <bool kDepth, bool kId> INLINE void end_blend(const TileWork &work, con
         }
         if (kDepth) image.depth[p] = alpha > 0.f ? s.depth[i] / alpha : 0.f;
         if (kId) image.dominant_id[p] = s.id[i];
+        if (kCentre) {
+            image.centre[2 * p] = alpha > 0.f ? s.x[i] / alpha + float(work.tx * kTile) : 0.f;
+            image.centre[2 * p + 1] = alpha > 0.f ? s.y[i] / alpha + float(work.ty * kTile) : 0.f;
+        }
     });
 }
 
-template <bool kDepth, bool kId, bool kWeight>
+template <bool kDepth, bool kId, bool kWeight, bool kCentre>
 int64_t blend_part(const TileWork &work, const Image &image, BlendPart part, BlendState &state) {
     const Lanes lanes;
     if (part & kBlendStart) start_blend(work, image, lanes, state);
-    const int64_t pairs = go_on_blending<kDepth, kId, kWeight>(work, image, lanes, state);
-    if (part & kBlendEnd) end_blend<kDepth, kId>(work, image, state);
+    const int64_t pairs = go_on_blending<kDepth, kId, kWeight, kCentre>(work, image, lanes, state);
+    if (part & kBlendEnd) end_blend<kDepth, kId, kCentre>(work, image, state);
     return pairs;
 }
 
 // Not inlined: the compiler would see that nobody looks at most of the result.
 __attribute__((noinline)) void blend_again(const BlendRound &round, BlendBlock &s, const Lanes &lanes) {
     for (int i = 0; i < kPixels; i++) s.left[i] = 1.f;
-    blend_block<false, false, false>(round, s, lanes, 0, nullptr);
+    blend_block<false, false, false, false>(round, s, lanes, 0, nullptr);
 }
 
 int64_t blend_limit(int64_t repeats) {
@@ -209,15 +218,16 @@ int64_t blend_limit(int64_t repeats) {
 
 int64_t blend_parts(const TileWork &work, const Image &image, BlendPart part, BlendState &state) {
     const int which = (image.depth ? 1 : 0) | (image.dominant_id ? 2 : 0) | (image.max_weight ? 4 : 0);
+    if (image.centre) return blend_part<true, false, false, true>(work, image, part, state);
     switch (which) {
-        case 0: return blend_part<false, false, false>(work, image, part, state);
-        case 1: return blend_part<true, false, false>(work, image, part, state);
-        case 2: return blend_part<false, true, false>(work, image, part, state);
-        case 3: return blend_part<true, true, false>(work, image, part, state);
-        case 4: return blend_part<false, false, true>(work, image, part, state);
-        case 5: return blend_part<true, false, true>(work, image, part, state);
-        case 6: return blend_part<false, true, true>(work, image, part, state);
-        default: return blend_part<true, true, true>(work, image, part, state);
+        case 0: return blend_part<false, false, false, false>(work, image, part, state);
+        case 1: return blend_part<true, false, false, false>(work, image, part, state);
+        case 2: return blend_part<false, true, false, false>(work, image, part, state);
+        case 3: return blend_part<true, true, false, false>(work, image, part, state);
+        case 4: return blend_part<false, false, true, false>(work, image, part, state);
+        case 5: return blend_part<true, false, true, false>(work, image, part, state);
+        case 6: return blend_part<false, true, true, false>(work, image, part, state);
+        default: return blend_part<true, true, true, false>(work, image, part, state);
     }
 }
 

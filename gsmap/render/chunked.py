@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from gsmap.geometry.sh import sh0_of_rgb
+from gsmap.render import native
 from gsmap.render.index import ChunkIndex, join_ranges
+from gsmap.render.outputs import Rendering, image_size
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.gaussians import FIELDS
 from gsmap.types.source import ChunkSource
@@ -33,10 +33,9 @@ class ChunkedGaussians:
         starts = np.append(np.arange(0, n, source.rows, dtype=np.int64), n)
         radius = _BEYOND_BOX * (boxes[:, 1] - boxes[:, 0]).max(1, initial=0)
         self._coarse = ChunkIndex(starts, boxes[:, 0], boxes[:, 1], radius)
-        self._has_shape, self._has_colour, self._has_position_colour = np.zeros((3, len(boxes)), dtype=bool)
+        self._has_shape, self._has_colour = np.zeros((2, len(boxes)), dtype=bool)
         shapes = (n, 3), (n, 4), (n, 3), (n,), (n, (source.sh_degree + 1) ** 2, 3)
         self._gaussians = Gaussians(*(np.empty(shape, np.float32) for shape in shapes))
-        self._position_sh = np.zeros((0, 1, 3), np.float32)
         fine = np.append(np.arange(0, n, _ROWS, dtype=np.int64), n)
         unknown = np.full((len(fine) - 1, 3), np.nan)  # not visible: every comparison is False
         self._fine = ChunkIndex(fine, unknown, unknown.copy(), unknown[:, 0].copy())
@@ -51,12 +50,6 @@ class ChunkedGaussians:
         out._has_shape[:] = out._has_colour[:] = True
         return out
 
-    @property
-    def box(self) -> np.ndarray:
-        """(2, 3) box around all Gaussians."""
-        boxes = self._source.boxes
-        return np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)]) if len(boxes) else np.zeros((2, 3))
-
     def seen_from(self, camera: Cameras) -> tuple[Gaussians, ChunkIndex]:
         """Read what one camera may see; return arrays of all N Gaussians, and an index of those that were read."""
         for start, stop, part in self._read(FIELDS[:-1], self._coarse, camera, self._has_shape):
@@ -66,20 +59,17 @@ class ChunkedGaussians:
             pass
         return self._gaussians, self._fine
 
-    def coloured_by_position(self, camera: Cameras) -> tuple[Gaussians, ChunkIndex]:
-        """Return the same as `seen_from`, with the means as colours: (0, 0, 0) at one corner of ``box``, (1, 1, 1) at
-        the opposite corner."""
+    def render(self, camera: Cameras, *, with_centres: bool = False) -> Rendering:
+        """Render colour, alpha and depth from one camera, and with ``with_centres`` also `Rendering.centre`."""
         gaussians, index = self.seen_from(camera)
-        if len(self._position_sh) != len(gaussians):
-            self._position_sh = np.empty((len(gaussians), 1, 3), np.float32)
-        low, high = self.box
-        missing = self._has_colour & ~self._has_position_colour
-        for chunk in np.flatnonzero(missing).tolist():  # one by one, in the cache
-            rows = slice(*self._coarse.starts[chunk : chunk + 2])
-            rgb = (gaussians.means[rows] - low) / np.maximum(high - low, 1e-9)
-            self._position_sh[rows, 0] = sh0_of_rgb(rgb)
-        self._has_position_colour |= missing
-        return replace(gaussians, sh=self._position_sh), index
+        width, height = image_size(camera)
+        images = native.allocate(1, height, width, len(gaussians), True, False, False)
+        if with_centres:
+            images["centre"] = np.empty((1, height, width, 2), np.float32)
+        at = camera.T_camera_frame[0], camera.intrinsics_px[0], np.zeros(3, np.float32)
+        with native.workspace() as view:
+            native.draw(view, native.arrays_of(gaussians), *at, images, 0, index)
+        return Rendering(**images)
 
     def _read(
         self, fields: Sequence[str], index: ChunkIndex, camera: Cameras, done: np.ndarray

@@ -73,6 +73,7 @@ def allocate(
         "depth": np.empty(shape, np.float32) if depth else None,
         "dominant_id": np.empty(shape, np.int32) if dominant_id else None,
         "max_weight": np.zeros(num_gaussians, np.float32) if max_weight else None,
+        "centre": None,
     }
 
 
@@ -91,7 +92,8 @@ def draw(
     view_arguments = _view_arguments(T_camera_frame, intrinsics_px, background, images, i)
     height, width = images["alpha"].shape[1:]
     ranges, depths, blocks = index.candidates(view_arguments["pose"], intrinsics_px, width, height, _BLOCK_PX)
-    view.draw(*arrays, ranges=ranges, depths=depths, blocks=blocks, **view_arguments)
+    centre = None if images["centre"] is None else images["centre"][i]
+    view.draw(*arrays, ranges=ranges, depths=depths, blocks=blocks, centre=centre, **view_arguments)
 
 
 def _check_index(index: ChunkIndex, arrays: tuple[np.ndarray, ...]) -> None:

@@ -19,6 +19,7 @@ class Rendering:
         depth: (C, H, W) float32 expected camera-space z, ``sum w z / sum w``, 0 where alpha is 0; or None.
         dominant_id: (C, H, W) int32 Gaussian with the largest blending weight, -1 where nothing was drawn; or None.
         max_weight: (N,) float32 largest blending weight of each Gaussian over all pixels of all views; or None.
+        centre: (C, H, W, 2) float32 mean image position, by blending weight, of the Gaussians' centres; or None.
     """
 
     colour: Any
@@ -26,6 +27,7 @@ class Rendering:
     depth: Any = None
     dominant_id: Any = None
     max_weight: Any = None
+    centre: Any = None
 
 
 def image_size(cameras: Cameras) -> tuple[int, int]:

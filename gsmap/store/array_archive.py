@@ -27,8 +27,8 @@ TAIL_BYTES = 64 << 10
 """Number of bytes read first, from the end: enough for the table and metadata of a scene with two million Gaussians."""
 
 _ZSTD_LEVEL, _FLOAT_LEVEL = 1, -1
-"""Levels of zstd. Below 0 it copies what finds no match, such as mantissas, instead of coding it by its entropy: float32
-arrays are a tenth larger, and read four times as fast."""
+"""Levels of zstd. Below 0 it copies what finds no match, such as mantissas, instead of coding it by its entropy: arrays
+of float32 are a tenth larger, and read four times as fast."""
 _FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # equal arrays give equal bytes, whenever they are written
 _END, _END_64, _LOCATOR = struct.Struct("<4s4H2LH"), struct.Struct("<4sQ2H2L4Q"), struct.Struct("<4sLQL")
 _ENTRY, _LOCAL = struct.Struct("<4s6H3L5H2L"), struct.Struct("<4s5H3L2H")

@@ -1,10 +1,13 @@
 """Rendering through an index of chunk boxes leaves nothing out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsmap.geometry.sh import rgb_of_sh0
+from gsmap.geometry.projection import project
+from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.geometry.voxels import reached_box
 from gsmap.render import ChunkIndex, GaussianTensors, render
 from gsmap.render.chunked import ChunkedGaussians
@@ -133,9 +136,21 @@ def test_chunks_that_are_read_when_seen_change_no_bit(largest):
         assert any(colours < shapes for colours, shapes in read_after)
 
 
-def test_positions_as_colours_are_those_of_the_rows_that_were_read():
+def test_centres_are_those_of_the_gaussians_by_their_weights():
     gaussians = site(5000, 5, -2.0)
-    chunked = ChunkedGaussians.of(gaussians)
-    coloured, _ = chunked.coloured_by_position(some_cameras(1)[0])
-    low, high = chunked.box
-    assert np.allclose(rgb_of_sh0(coloured.sh[:, 0]) * (high - low) + low, gaussians.means, atol=1e-4)
+    camera = some_cameras(1)[0]
+    rendered = ChunkedGaussians.of(gaussians).render(camera, with_centres=True)
+    plain = render(gaussians, camera)
+    for name in ("colour", "depth", "alpha"):
+        assert np.array_equal(getattr(rendered, name), getattr(plain, name)), name
+    # The same by colours: each Gaussian has its own position in the image.
+    at, depth = project(gaussians.means.astype(np.float64), camera.T_camera_frame[0], camera.intrinsics_px[0])
+    seen = depth > 0.01
+    rgb = np.zeros((len(gaussians), 3))
+    rgb[seen, :2] = at[seen] + 1000  # no colour is negative
+    coloured = replace(gaussians, sh=sh0_of_rgb(rgb)[:, None].astype(np.float32))
+    shown = render(coloured, camera)
+    solid = shown.alpha[0] > 0.5
+    expected = shown.colour[0][solid][:, :2] / shown.alpha[0][solid][:, None] - 1000
+    assert np.abs(rendered.centre[0][solid] - expected).max() < 0.01
+    assert solid.any()
