@@ -12,7 +12,7 @@ from gsmap.register.params import Params
 from gsmap.register.refinement import refiner_for
 from gsmap.types.plain import plain
 
-VERSION = 22
+VERSION = 23
 PREPARE_VERSION = 2
 
 _RENDER_BACKEND = "native"  # all renders of this room use it

@@ -1,15 +1,17 @@
 """Find where else a source agrees with a target in shape and colour about as well as under a given pose.
 
 In a corridor, a colonnade or a parking deck, and along a façade, a pose that is one period off agrees nearly
-everywhere; in a symmetric room, so does a pose that is turned. The nodes of the scene graphs propose some of these
-poses, never all. Therefore the surfaces are correlated over all horizontal shifts, at every quarter turn about the
-vertical, by fast Fourier transforms of grids of cells.
+everywhere; in a stairwell, so does a pose that is a storey off, and in a symmetric room a pose that is turned. The
+nodes of the scene graphs propose some of these poses, never all. Therefore the surfaces are correlated over all shifts,
+at every quarter turn about the vertical, by fast Fourier transforms of grids of cells.
 
 The constants were chosen on synthetic halls and façades (`tools.bench.repetitive`, seeds 101 to 104).
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +21,9 @@ from gsmap.register.evidence import OPPONENT
 from gsmap.register.surface import Surface
 from gsmap.types import Sim3
 
-_CELL_M = np.array([0.2, 0.2, 0.4])  # cells are taller than wide, as levels stay where they are;
+_CELL_M = np.array([0.2, 0.2, 0.4])  # cells are taller than wide, as most places repeat along the ground;
 _MAX_CELLS = 4_000_000  # of the box of a surface: cells are doubled until it has no more,
-_MAX_SHIFTS = 64_000_000  # and no more shifts, times levels, at any quarter turn
+_MAX_SHIFTS = 16_000_000  # and no more shifts at any quarter turn
 _STRAY = 0.01  # share of points on each side of each axis that are strays if they lie half the others' extent outside
 _BLUR_CELLS = 0.7  # so that shifts by a fraction of a cell matter little
 _AROUND = (3, 5, 5)  # cells (z, x, y) over which the mean colour is subtracted
@@ -31,10 +33,12 @@ MARGIN = 0.3
 """A pose is told from another, and from chance, if the surfaces are more similar under it by this much (`fisher_z`)."""
 _MOST = 0.98  # correlations count up to this
 _PARTS = np.array([[0, 0, 0], [0.5, 0, 0], [0, 0.5, 0], [0.5, 0.5, 0]])  # of a cell by which the cells are offset
-_MAX_PEAKS = 50  # at each quarter turn
-_PEAK_CELLS = 7  # width within which only the highest correlation counts
+_RISES = 0.0, 0.5  # of a cell, by which the source is raised at each quarter turn
+_MAX_PEAKS = 50  # at each turn and rise
+_PEAK_CELLS = 3, 7, 7  # (z, x, y) within which only the highest correlation counts
 _REFINEMENT = 0.2  # by which the similarity may rise when a pose is refined
 _MAX_LOSS = 0.2  # of correlation between the cells, at most
+_ZXY, _XYZ = [2, 0, 1], [1, 2, 0]  # orders of axes
 _ROUNDING = 1e-4  # of sums of squares by fast Fourier transforms
 _DISTANCE_M = 1.0  # nearer poses are refined to the given one
 
@@ -88,23 +92,24 @@ class Repetition:
             return []
         found, centre, enough = list[tuple[Sim3, float]](), np.median(self._moved, axis=0), 0.0
         least = max(own - MARGIN, MARGIN) - _REFINEMENT
-        for quarter in range(4):
-            turn = _quarter_turn(quarter, centre)
-            if quarter:
-                other = _Grid.of(turn.apply(self._moved), self._colours[1], self._cell_m)
+        for quarter, rise in itertools.product(range(4), _RISES):
+            turn = _quarter_turn(quarter, centre, rise * self._cell_m[2])
+            other = _Grid.of(turn.apply(self._moved), self._colours[1], self._cell_m)
             correlation, count = _correlate(grid, other)
-            extent, first = np.array(other.occupied.shape[1:]), (other.low - grid.low)[:2]
-            if quarter == 0:
-                enough = max(_MIN_SHARE * count[tuple(first % count.shape)], _MIN_CELLS)
+            shape = np.array(count.shape)
+            extent, first = np.array(other.occupied.shape), (other.low - grid.low)[_ZXY]
+            if not enough:
+                enough = max(_MIN_SHARE * count[tuple(first % shape)], _MIN_CELLS)
             correlation[count < enough] = 0.0
             is_peak = (correlation == maximum_filter(correlation, _PEAK_CELLS, mode="wrap")) & (count >= enough)
             peaks = np.argwhere(is_peak & (correlation > np.tanh(least) - _MAX_LOSS))
             for at in peaks[np.argsort(-correlation[tuple(peaks.T)], kind="stable")[:_MAX_PEAKS]]:
                 peak, part = _interpolated(correlation, at)
-                shift = np.append(((at + extent) % count.shape - extent - first + part) * self._cell_m[:2], 0.0)
-                if fisher_z(peak) >= least and (quarter or np.linalg.norm(shift) > _DISTANCE_M):
-                    S = self._level.inverse() @ Sim3(turn.rotation, turn.translation + shift) @ self._level @ self._pose
-                    found.append((S, fisher_z(peak)))
+                shift = ((at + extent) % shape - extent - first + part)[_XYZ] * self._cell_m
+                S = Sim3(turn.rotation, turn.translation + shift)
+                is_elsewhere = quarter or np.linalg.norm(S.translation) > _DISTANCE_M
+                if fisher_z(peak) >= least and is_elsewhere:
+                    found.append((self._level.inverse() @ S @ self._level @ self._pose, fisher_z(peak)))
         return sorted(found, key=lambda one: -one[1])
 
 
@@ -120,16 +125,16 @@ def _without_strays(points: np.ndarray) -> np.ndarray:
 
 def _is_too_large(cells: np.ndarray) -> bool:
     """Return whether boxes of (2, 3) cells of target and source take too much memory and time to correlate."""
-    shifts = cells[:, :2].max(1).sum() ** 2 * cells[:, 2].min()
+    shifts = cells[:, :2].max(1).sum() ** 2 * cells[:, 2].sum()
     return bool(cells.prod(1).max() > _MAX_CELLS or shifts > _MAX_SHIFTS)
 
 
 def _interpolated(values: np.ndarray, at: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the height of a peak (X, Y) between the cells, by a parabola along each axis, and its (2,) offset in cells
-    from the cell ``at``."""
-    height, offset = float(values[tuple(at)]), np.zeros(2)
-    for axis in range(2):
-        step = np.eye(2, dtype=np.int64)[axis]
+    """Return the height of a peak (Z, X, Y) between the cells, by a parabola along each axis, and its (3,) offset in
+    cells from the cell ``at``."""
+    height, offset = float(values[tuple(at)]), np.zeros(3)
+    for axis in range(3):
+        step = np.eye(3, dtype=np.int64)[axis]
         before, after = (float(values[tuple((at + side * step) % values.shape)]) for side in (-1, 1))
         bend = before - 2 * values[tuple(at)] + after
         if bend < 0:
@@ -143,11 +148,11 @@ def fisher_z(correlation: float) -> float:
     return float(np.arctanh(np.clip(correlation, -_MOST, _MOST)))
 
 
-def _quarter_turn(quarter: int, centre: np.ndarray) -> Sim3:
-    """Return the rotation by a number of quarter turns about the vertical through a point."""
+def _quarter_turn(quarter: int, centre: np.ndarray, rise_m: float) -> Sim3:
+    """Return the rotation by a number of quarter turns about the vertical through a point, and a rise."""
     c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return Sim3(rotation, centre - rotation @ centre)
+    return Sim3(rotation, centre - rotation @ centre + np.array([0.0, 0.0, rise_m]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,22 +219,22 @@ def _common_correlation(target: _Grid, source: _Grid) -> float:
 
 
 def _correlate(target: _Grid, source: _Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for every horizontal shift between the first cells of source and target, the (X, Y) correlation
-    of contrasts over the cells that are occupied in both grids, and the (X, Y) number of these; negative shifts are
-    counted from the end."""
-    from scipy.fft import irfft2, next_fast_len, rfft2
+    """Return, for every shift between the first cells of source and target, the (Z, X, Y) correlation of contrasts over
+    the cells that are occupied in both grids, and the (Z, X, Y) number of these; negative shifts are counted from the
+    end."""
+    from scipy.fft import irfftn, next_fast_len, rfftn
 
-    shapes = target.occupied.shape[1:], source.occupied.shape[1:]
+    shapes = target.occupied.shape, source.occupied.shape
     size = [next_fast_len(a + b, real=True) for a, b in zip(*shapes, strict=True)]
-    sums = np.zeros((4, size[0], size[1] // 2 + 1), np.complex64)
-    for level in range(max(target.low[2], source.low[2]), min(target.high[2], source.high[2])):
-        spectra = []
-        for grid in (target, source):
-            occupied, contrast = grid.occupied[level - grid.low[2]], grid.contrast[:, level - grid.low[2]]
-            spectra.append(rfft2(np.stack([occupied, (contrast**2).sum(0), *contrast]), s=size))
-        a, b = spectra[0], spectra[1].conj()
-        sums += np.stack([(a[2:] * b[2:]).sum(0), a[1] * b[0], a[0] * b[1], a[0] * b[0]])
-    products, squares_t, squares_s, count = irfft2(sums, s=size)
+
+    def spectra(grid: _Grid) -> Iterator[np.ndarray]:
+        return (rfftn(values, s=size) for values in (grid.occupied, (grid.contrast**2).sum(0), *grid.contrast))
+
+    pairs = zip(spectra(target), spectra(source), strict=True)
+    (occupied_t, occupied_s), (squares_t, squares_s) = next(pairs), next(pairs)
+    count = irfftn(occupied_t * occupied_s.conj(), s=size)
     # Less contrast than this share of the most is a rounding error of the transforms.
-    norm = [np.maximum(squares, _ROUNDING * squares.max() + 1e-9) for squares in (squares_t, squares_s)]
-    return products / np.sqrt(norm[0] * norm[1]), count
+    norms = (irfftn(a * b.conj(), s=size) for a, b in ((squares_t, occupied_s), (occupied_t, squares_s)))
+    norm = np.prod([np.maximum(squares, _ROUNDING * squares.max() + 1e-9) for squares in norms], axis=0)
+    products = sum(a * b.conj() for a, b in pairs)
+    return irfftn(products, s=size) / np.sqrt(norm), count

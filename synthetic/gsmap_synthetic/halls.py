@@ -1,9 +1,9 @@
-"""Halls that repeat: corridors, colonnades, parking decks, and rooms that look alike from two or four sides.
+"""Halls that repeat: corridors, colonnades, parking decks, stairwells, and rooms that look alike from several sides.
 
 One bay follows the other, each the same to the last texel, so that two captures agree wherever one is laid a period
 along the other, or turned. What is unique stands or hangs in some bays, or nowhere.
 
-Place frame: metres, x along the hall, z up, the floor at z = 0.
+Place frame: metres, x along the hall (up the stairwell: z), z up, the floor at z = 0.
 """
 
 from __future__ import annotations
@@ -23,11 +23,18 @@ from gsmap_synthetic.make import DemoCapture, make_captures
 from gsmap_synthetic.place import Place
 from gsmap_synthetic.surfaces import Surfaces
 
-Kind = Literal["corridor", "colonnade", "parking deck", "symmetric room"]
+Kind = Literal["corridor", "colonnade", "parking deck", "symmetric room", "stairwell"]
 _GLOW = 0.8
 _HIGH_M = 2.6
-_WIDTHS_M = {"corridor": 2.4, "colonnade": 9.0, "parking deck": 14.0, "symmetric room": 5.0}
-_PERIODS_M = {"corridor": (2.6, 4.2), "colonnade": (3.0, 4.5), "parking deck": (4.8, 5.4), "symmetric room": (5.0, 5.0)}
+_WIDTHS_M = {"corridor": 2.4, "colonnade": 9.0, "parking deck": 14.0, "symmetric room": 5.0, "stairwell": 3.0}
+_PERIODS_M = {
+    "corridor": (2.6, 4.2),
+    "colonnade": (3.0, 4.5),
+    "parking deck": (4.8, 5.4),
+    "symmetric room": (5.0, 5.0),
+    "stairwell": (2.7, 3.3),
+}
+_STOREYS, _DEEP_M, _LANDING_M = 9, 5.0, 1.2  # of a stairwell
 LENGTH_M, REACH_M, STEP_M = 46.0, 14.0, 7.0
 FAR_M = 12.0
 """Depths beyond this are not captured, so that the ends of a hall are seen only from near."""
@@ -45,7 +52,8 @@ def make_hall(
 
     Args:
         kind: ``corridor`` (doors and lamps on both sides), ``colonnade`` (two rows of columns), ``parking deck``
-            (columns and painted bays), or ``symmetric room`` (equal walls, as seen after a half or a quarter turn).
+            (columns and painted bays), ``symmetric room`` (equal walls, as seen after a half or a quarter turn), or
+            ``stairwell`` (equal storeys of two flights of stairs).
         unique: things that are like no other, per bay; 0 leaves nothing that tells one bay from the other.
 
     Raises:
@@ -57,6 +65,12 @@ def make_hall(
     width, period = _WIDTHS_M[kind], rng.uniform(*_PERIODS_M[kind])
     if kind == "symmetric room":
         _symmetric_room(s, rng, width, unique)
+    elif kind == "stairwell":
+        looks = int(rng.integers(1 << 30))
+        for k in range(_STOREYS):
+            _storey(s.at(0, 0, k * period).object("bay", "shell"), np.random.default_rng(looks), period, width)
+            for _ in range(rng.poisson(unique)):
+                _unique_thing(s.at(0, -_LANDING_M / 2, k * period), rng, width, _LANDING_M)
     else:
         count = int(np.ceil(LENGTH_M / period))
         build = {"corridor": _corridor_bay, "colonnade": _colonnade_bay, "parking deck": _parking_bay}[kind]
@@ -127,6 +141,31 @@ def _parking_bay(s: Surfaces, rng: np.random.Generator, period: float, width: fl
     s.box(period / 2, 0, _HIGH_M - 0.35, 0.3, width, 0.35, concrete, glow=_GLOW)
 
 
+def _storey(s: Surfaces, rng: np.random.Generator, height: float, width: float) -> None:
+    """Four walls, a landing with a door and a picture, and two flights of stairs with a landing between them."""
+    shell = s.at(width / 2, _DEEP_M / 2 - _LANDING_M)
+    for wall, wide in enumerate((width, _DEEP_M) * 2):
+        side = shell.at(0, 0, 0, wall * np.pi / 2).at(0, -(width + _DEEP_M - wide) / 2)
+        paint = tx.plaster(colour(rng, saturation=(0.05, 0.45), value=(0.55, 0.9)), int(rng.integers(1 << 20)))
+        side.rectangle([wide / 2, 0, 0], [-wide, 0, 0], [0, 0, height], paint, (0, 0), _GLOW)
+    stone = tx.marble(
+        colour(rng, saturation=(0.05, 0.3), value=(0.4, 0.7)), np.full(3, 0.4), int(rng.integers(1 << 20))
+    )
+    run, steps = _DEEP_M - 2 * _LANDING_M, 9
+    for half in range(2):
+        z, y = 0.5 * half * height, half * (_DEEP_M - _LANDING_M)
+        s.box(width / 2, y - _LANDING_M / 2, z - 0.15, width, _LANDING_M, 0.15, stone, glow=_GLOW)
+        for k in range(steps):
+            y = run * (k + 0.5) / steps
+            top = z + 0.5 * height * (k + 1) / steps - 0.15
+            x = width * (0.25 + 0.5 * half)
+            s.box(x, run - y if half else y, top, 0.45 * width, run / steps, 0.15, stone, glow=_GLOW)
+    wood, frame = tx.wood(colour(rng, (0.03, 0.12), (0.3, 0.7), (0.3, 0.7)), 7), tx.plain(np.full(3, 0.2))
+    s.box(0.7 * width, 0.03 - _LANDING_M, 0.01, 0.95, 0.05, 2.0, wood, glow=_GLOW)
+    print_ = tx.picture(palette(rng, 5), int(rng.integers(1 << 20)), int(rng.integers(4)))
+    s.at(width, 1.0, 0, np.pi / 2).box(0, 0.03, 0.6 * height, 0.8, 0.06, 0.5, frame, front=print_, glow=_GLOW)
+
+
 def _unique_thing(s: Surfaces, rng: np.random.Generator, period: float, width: float) -> None:
     """A poster on a wall, or a crate or bin before it."""
     side, x, seed = rng.choice([-1, 1]), rng.uniform(0.7, period - 0.7), int(rng.integers(1 << 20))
@@ -168,18 +207,26 @@ def _symmetric_room(s: Surfaces, rng: np.random.Generator, width: float, unique:
 def _hall_walk(place: Place, kind: Kind, start_m: float, count: int, seed: int) -> np.ndarray:
     """(count, 4, 4) camera poses of a walk along a hall, there and back, looking ahead and to the sides."""
     rng, out = np.random.default_rng([place.seed, seed, 63]), []
-    phase, wide = rng.uniform(0, 2 * np.pi, 3), _WIDTHS_M[kind]
+    phase, wide, storey_m = rng.uniform(0, 2 * np.pi, 3), _WIDTHS_M[kind], place.skin.corners[..., 2].max() / _STOREYS
     for i in range(count):
-        way = 2 * i / count
+        way, floor_m = 2 * i / count, 0.0
         if kind == "symmetric room":
             angle = 2 * np.pi * i / count + phase[0]
             x, y, yaw = 0.3 * wide * np.cos(angle), 0.3 * wide * np.sin(angle), 2 * angle + phase[1]
+        elif kind == "stairwell":
+            up = (start_m + REACH_M * i / count) / STEP_M  # storeys
+            back, along = divmod(2 * (up % 1), 1)
+            x, y = (
+                wide * (0.25 + 0.5 * back),
+                (along if not back else 1 - along) * (_DEEP_M - _LANDING_M) - _LANDING_M / 2,
+            )
+            floor_m, yaw = up * storey_m, 14 * np.pi * i / count + phase[1]
         else:
             x = start_m + REACH_M * (way if way < 1 else 2 - way)
             y = 0.2 * wide * np.sin(5 * way + phase[0])
             yaw = np.pi * (way >= 1) + 1.1 * np.sin(9 * np.pi * way + phase[1])
         pitch = -0.05 + 0.3 * np.sin(11 * np.pi * way + phase[2])
-        out.append(look_along(x, y, 1.5 + 0.1 * np.sin(5 * way), yaw, pitch))
+        out.append(look_along(x, y, floor_m + 1.5 + 0.1 * np.sin(5 * way), yaw, pitch))
     return np.stack(out)
 
 
@@ -194,7 +241,7 @@ def hall_captures(
 ) -> list[DemoCapture]:
     """Capture a hall in stretches of `REACH_M` every `STEP_M`, each in its own random frame, in metres.
 
-    A symmetric room is captured as a whole each time.
+    A symmetric room is captured as a whole each time, a stairwell over two storeys.
     """
     rng = np.random.default_rng([place.seed, 67])
     starts = [2.0 + k * STEP_M + float(rng.uniform(-1, 1)) for k in range(count)]

@@ -16,14 +16,15 @@ def _quads(place, name):
     return [np.flatnonzero(place.skin.owners == thing.id) for thing in place.objects if thing.name == name]
 
 
-@pytest.mark.parametrize("kind", KINDS[:3])
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "symmetric room"])
 def test_every_bay_is_the_first_one_moved_along(kind):
     hall = make_hall(kind, 4, unique=0.0, texel_m=0.3)
     first, *others = _quads(hall, "bay")
     assert len(others) > 5
     corners = hall.skin.corners
     period = (corners[others[0]] - corners[first]).mean((0, 1))
-    np.testing.assert_allclose(period[1:], 0, atol=1e-5)
+    axis = 2 if kind == "stairwell" else 0
+    np.testing.assert_allclose(np.delete(period, axis), 0, atol=1e-5)
     for k, bay in enumerate(others, 1):
         np.testing.assert_allclose(
             corners[bay] - corners[first], np.broadcast_to(k * period, (len(bay), 4, 3)), atol=1e-4

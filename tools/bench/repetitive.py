@@ -2,14 +2,14 @@
 
     python -m tools.bench.repetitive --cache FOLDER [--kinds corridor facade ...] [--seeds 201 202 ...] [--pairs]
 
-Façades, corridors, colonnades, parking decks, rooms that look alike from several sides, and flats of one make with
-other furniture (`gsmap_synthetic`): five captures of each seed, with the faults that captures have, and all pairs of
-them. In one of three places nothing is unique, in the others some bays or most have things of their own. Truth is
-exact. A pose is wrong if it puts the source's middle more than 0.3 m or 3 degrees off; it is over 5 sigma off if one of
-the axes of its covariance is. Two flats of one make are different places: every pose between them is wrong. Of changed
-flats two captures show what is left after 30 and 60 % of the furniture changed, and one shows another flat of the make.
-"Used" are edges that are neither refused nor tentative in the map of the five captures. Seeds from 200 on had no part
-in any fit.
+Façades, corridors, colonnades, parking decks, stairwells, rooms that look alike from several sides, and flats of one
+make with other furniture (`gsmap_synthetic`): five captures of each seed, with the faults that captures have, and all
+pairs of them. In one of three places nothing is unique, in the others some bays or most have things of their own. Truth
+is exact. A pose is wrong if it puts the source's middle more than 0.3 m or 3 degrees off; it is over 5 sigma off if one
+of the axes of its covariance is. Two flats of one make are different places: every pose between them is wrong. Of
+changed flats two captures show what is left after 30 and 60 % of the furniture changed, and one shows another flat of
+the make. "Used" are edges that are neither refused nor tentative in the map of the five captures. Seeds from 200 on had
+no part in any fit.
 """
 
 # Thread counts must be set before numpy comes in.
