@@ -136,8 +136,6 @@ def _compare_elsewhere(
     up = target.graph.up
     if up is None and source.graph.up is not None:
         up = best.proposal.S_target_source.rotation @ source.graph.up
-    if up is None:
-        return evaluated, []
     pair, centre, unit_m = MetricPair.of(target, source, best.proposal, params), source.centre, own_working_m(target)
     with watch.step("verdict"):
         pose = pair.to_metres(best.proposal.S_target_source)

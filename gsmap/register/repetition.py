@@ -48,10 +48,13 @@ class Repetition:
 
     Args:
         target, source: surfaces in metres; ``pose`` (target from source) as well.
-        up: (3,) direction against gravity in the target's frame.
+        up: (3,) direction against gravity in the target's frame; if it is None, the direction that most of the target's
+            surface faces.
     """
 
-    def __init__(self, target: Surface, source: Surface, pose: Sim3, up: np.ndarray) -> None:
+    def __init__(self, target: Surface, source: Surface, pose: Sim3, up: np.ndarray | None) -> None:
+        if up is None:
+            up = np.linalg.eigh(target.normals.T @ target.normals)[1][:, -1]
         self._pose, self._level = pose, Sim3(level_frame(up), np.zeros(3))
         self._points, self._moved = self._level.apply(target.coarse[0]), (self._level @ pose).apply(source.coarse[0])
         kept = [_without_strays(points) for points in (self._points, self._moved)]
