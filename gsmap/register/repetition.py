@@ -40,6 +40,7 @@ _REFINEMENT = 0.2  # by which the similarity may rise when a pose is refined
 _MAX_LOSS = 0.2  # of correlation between the cells, at most
 _ZXY, _XYZ = [2, 0, 1], [1, 2, 0]  # orders of axes
 _ROUNDING = 1e-4  # of sums of squares by fast Fourier transforms
+_STOREY_M = 2.0  # no storey is lower; along smaller rises courses of bricks agree, never whole storeys
 _DISTANCE_M = 1.0  # nearer poses are refined to the given one
 
 
@@ -111,7 +112,8 @@ class Repetition:
                 shift = ((at + extent) % shape - extent - first + part)[_XYZ] * self._cell_m
                 S = Sim3(turn.rotation, turn.translation + shift)
                 is_elsewhere = quarter or np.linalg.norm(S.translation) > _DISTANCE_M
-                if fisher_z(peak) >= least and is_elsewhere:
+                is_a_floor = not self._cell_m[2] <= abs(S.translation[2]) < _STOREY_M
+                if fisher_z(peak) >= least and is_elsewhere and is_a_floor:
                     found.append((self._level.inverse() @ S @ self._level @ self._pose, fisher_z(peak)))
         return sorted(found, key=lambda one: -one[1])
 
