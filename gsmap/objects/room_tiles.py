@@ -60,7 +60,8 @@ def update_rooms(
         own = [room for room in found if _tile_of(room) == tile]
         rooms += own
         doors += [[found[other] for other in room.doors] for room in own]
-    return order_rooms([replace(room, doors=_places(rooms, i, doors[i])) for i, room in enumerate(rooms)])
+    every = np.array([room.box for room in rooms])
+    return order_rooms([replace(room, doors=_places(rooms, every, i, doors[i])) for i, room in enumerate(rooms)])
 
 
 def is_small(boxes: Iterable[np.ndarray]) -> bool:
@@ -109,12 +110,14 @@ def _tile_of(room: Room) -> Tile:
     return x, y
 
 
-def _places(rooms: Sequence[Room], own: int, doors: Sequence[Room]) -> tuple[int, ...]:
-    """Return the indices of the rooms that doors of one room lead to; a room found in two tiles is one."""
+def _places(rooms: Sequence[Room], boxes: np.ndarray, own: int, doors: Sequence[Room]) -> tuple[int, ...]:
+    """Return the indices of the rooms, with their ``boxes`` (N, 2, 3), that doors of one room lead to; a room found in
+    two tiles is one."""
     out = set()
     for target in doors:
         cells = np.argwhere(target.cells)
         at = target.low + (cells[len(cells) // 2] + 0.5) * target.cell_m
         point = np.array([*at, target.floor_m])
-        out |= {i for i, room in enumerate(rooms) if room is target or (room.holds(point) and i != own)}
+        near = np.flatnonzero(((boxes[:, 0] <= point) & (point <= boxes[:, 1]))[:, :2].all(1))
+        out |= {i for i in near.tolist() if rooms[i] is target or (rooms[i].holds(point) and i != own)}
     return tuple(sorted(out - {own}))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -53,13 +52,12 @@ class Room:
         for axis in (0, 1):
             # Which way one steps over each border between two cells: out of the room, into it, or neither.
             step = np.diff(cells if axis == 0 else cells.T, axis=0)[:, 1:-1]
-            for line, along in enumerate(step):
-                ends = np.flatnonzero(np.diff(np.concatenate([[0], along, [0]])))
-                for first, last in pairwise(ends):
-                    if along[first]:
-                        both = np.array([[line, first], [line, last]])
-                        pieces.append(both if axis == 0 else both[:, ::-1])
-        at = self.low + np.array(pieces).reshape(-1, 2, 2) * self.cell_m
+            line, end = np.nonzero(np.diff(step, axis=1, prepend=0, append=0))
+            one = line[1:] == line[:-1]
+            line, first, last = line[:-1][one], end[:-1][one], end[1:][one]
+            both = np.stack([line, first, line, last], axis=1)[step[line, first] != 0].reshape(-1, 2, 2)
+            pieces.append(both if axis == 0 else both[..., ::-1])
+        at = self.low + np.concatenate(pieces) * self.cell_m
         return np.concatenate([at, np.full((*at.shape[:2], 1), self.floor_m)], axis=2)
 
     def holds(self, point: np.ndarray) -> bool:
