@@ -32,7 +32,7 @@ def status(
     store: Store, settings: Settings, num_open_changes: Callable[[Store, Settings], int], find_omitted: FindOmitted
 ) -> MapStatus:
     """Report the status of a map (``gsmap status MAP``) from the catalog. Nothing is computed but the warps of
-    exports that were made with ``--nonrigid``, if they are not cached.
+    exports that were made with ``--nonrigid``.
 
     Args:
         num_open_changes: returns the number of unreviewed changes.

@@ -20,14 +20,11 @@ from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.warps import Warp
 from gsmap.map import Map
 from gsmap.map.jobs import _warped
-from gsmap.map.stages import nonrigid
 from gsmap.map.stages.nonrigid import WarpedCaptures, deformed_pairs
 from gsmap.merge.tile import LazyScene
 from gsmap.methods import RecipeKey
 from gsmap.register.deformation import NOTES
-from gsmap.register.scene_view import SceneView
 from gsmap.types import EdgeOutcome, Gaussians, PoseGraph, Registration, ScenePose, Sim3
-from gsmap.types.plain import canonical, plain
 
 SAG_M = 0.12  # 2 % of six metres
 BENT = {"left": False, "right": False, "bent": True, "after": True}
@@ -128,34 +125,6 @@ def test_pairs_are_deformed_by_their_edge_or_those_between_them(site: Map) -> No
     pairs = [(ids[a], ids[b]) for a, b in itertools.combinations(BENT, 2)]
     found = deformed_pairs(site.store, site.settings, graph, pairs)
     assert set(found) == {(ids[a], ids[b]) for a in ("left", "right") for b in ("bent", "after")}
-
-
-def test_warps_are_fitted_once_for_the_same_poses(site: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("GSMAP_CACHE", str(tmp_path / "cache"))
-    fitted: list[Sim3] = []
-
-    def fit(target: SceneView, source: SceneView, S: Sim3, **options: object) -> tuple[Sim3, Warp]:
-        fitted.append(S)
-        return S, Warp(np.full(3, 0.1), 2.0 / 3, np.full((3, 3), 0.01), np.full((3, 3, 3), 1e-3 / 3))
-
-    monkeypatch.setattr(nonrigid, "warp_onto", fit)
-    revision = site.store.revisions.newest_number()
-    graph = site.store.revisions.get(revision)
-    assert graph is not None
-    scenes = {scene.id: scene for scene in site.scenes()}
-
-    def warped(placed: dict[str, ScenePose]) -> tuple[WarpedCaptures, int]:
-        fitted.clear()
-        return nonrigid.warp_captures(site.store, site.settings, graph, placed, scenes), len(fitted)
-
-    (first, two), (again, none) = warped(graph.poses), warped(graph.poses)
-    assert (two, none) == (2, 0)
-    assert canonical(plain(again)) == canonical(plain(first))
-    for path in (tmp_path / "cache" / "warps").iterdir():
-        path.write_text("{")
-    assert warped(graph.poses)[1] == 2
-    moved = Sim3(np.eye(3), np.array([0.01, 0, 0]))
-    assert warped({s: replace(pose, S_map_scene=moved @ pose.S_map_scene) for s, pose in graph.poses.items()})[1] == 2
 
 
 def test_a_tile_is_made_again_for_another_warp(site: Map, tmp_path: Path) -> None:

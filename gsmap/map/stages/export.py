@@ -454,8 +454,8 @@ def dirty_tiles(store: Store, settings: Settings, find_omitted: FindOmitted) -> 
     the last export.
 
     Read from the catalog, which does not say which tiles are empty: new ones are not counted. Only warps of captures
-    that are not cached are fitted again. All tiles of static content count if the map's objects are out of date. A
-    folder whose export named a revision stays as it is, whatever the map does.
+    are fitted again. All tiles of static content count if the map's objects are out of date. A folder whose export
+    named a revision stays as it is, whatever the map does.
     """
     newest = {export.target: export for export in store.exports.list()}
     found: dict[str, tuple[int, Request]] = {}

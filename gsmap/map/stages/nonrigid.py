@@ -3,26 +3,20 @@ the other."""
 
 from __future__ import annotations
 
-import json
-import os
-import uuid
 from collections.abc import Collection, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from gsmap.errors import MALFORMED, InputError
+from gsmap.errors import InputError
 from gsmap.geometry.warps import Warp
 from gsmap.map.jobs import load_view
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys, without_graph
-from gsmap.methods import RecipeKey, text_digest
+from gsmap.methods import text_digest
 from gsmap.register import VERSION
 from gsmap.register.deformation import NOTES, warp_onto
-from gsmap.store import Store, cache
+from gsmap.store import Store
 from gsmap.texts import counted, few
 from gsmap.types import PoseGraph, Registration, Scene, ScenePose, Sim3
 from gsmap.types.plain import canonical, plain
@@ -115,60 +109,8 @@ def warp_captures(
     if missing := without_graph(store, keys):
         name = scenes[missing[0]].name
         raise InputError(f"scene {name} has no graph: run gsmap describe MAP {name!r} first", code="no_graph")
-    about = [
-        [store.id, VERSION, {scene: key.digest for scene, key in keys.items()}],
-        [[scenes[scene].name, scenes[scene].num_gaussians, placed[scene].S_map_scene] for scene in members],
-        [[edge.ends, edge.is_deformed, edge.with_scale, edge.registration.overlap] for edge in edges],
-    ]
-    path = cache.folder() / "warps" / f"{text_digest(canonical(plain(about)))}.json"
-    if (found := _load(path, placed)) is None:
-        found = _fit(store, edges, placed, scenes, keys)
-        _keep(path, found)
-    return found
-
-
-def _load(path: Path, placed: Mapping[str, ScenePose]) -> WarpedCaptures | None:
-    """Return warps that were fitted before, by the file that is named by all they depend on; None without it."""
-    try:
-        stored = json.loads(path.read_bytes())
-        poses = {scene: replace(placed[scene], S_map_scene=_of(Sim3, one)) for scene, one in stored["poses"].items()}
-        return WarpedCaptures(
-            poses, {scene: _of(Warp, one) for scene, one in stored["warps"].items()}, tuple(stored["notes"])
-        )
-    except (OSError, TypeError, *MALFORMED):
-        return None
-
-
-def _of(kind: type[Any], stored: Mapping[str, Any]) -> Any:
-    """Return a dataclass of numbers and arrays from its JSON object."""
-    return kind(**{name: np.array(value) if isinstance(value, list) else value for name, value in stored.items()})
-
-
-def _keep(path: Path, found: WarpedCaptures) -> None:
-    """Store fitted warps for later exports and ``gsmap status``; a full disk leaves them out."""
-    poses = {scene: pose.S_map_scene for scene, pose in found.poses.items()}
-    kept = json.dumps(plain({"poses": poses, "warps": found.warps, "notes": found.notes}))
-    staged = path.with_name(f".{uuid.uuid4().hex}")
-    with suppress(OSError):
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        try:
-            staged.write_text(kept)
-            cache.make_room(path.parent)
-            os.replace(staged, path)
-        finally:
-            staged.unlink(missing_ok=True)
-
-
-def _fit(
-    store: Store,
-    edges: list[_Edge],
-    placed: Mapping[str, ScenePose],
-    scenes: Mapping[str, Scene],
-    keys: Mapping[str, RecipeKey],
-) -> WarpedCaptures:
-    """Warp the captures of the components of some edges."""
     poses, warps, notes = dict[str, ScenePose](), dict[str, Warp](), list[str]()
-    for component in sorted({placed[edge.ends[0]].component for edge in edges}):
+    for component in sorted(components):
         anchor, tree = _spanning_tree([edge for edge in edges if placed[edge.ends[0]].component == component], scenes)
         notes.append(f"component {component}: capture {scenes[anchor].name} keeps its shape")
         for parent, child, edge in tree:
