@@ -114,7 +114,7 @@ def _outcomes(
 
 
 def _doubt_text(m: Measurements, row: int, params: Params) -> str:
-    if m.look_alike[row] <= params.max_look_alike:
+    if not m.look_alike[row] > params.max_look_alike:  # nor if it is unknown
         return "edges of this map that are as likely contradict others: they may join two places that look alike"
     return f"the captures show two places that look alike with a probability of {m.look_alike[row]:.0%}"
 

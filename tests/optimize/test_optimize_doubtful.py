@@ -70,6 +70,15 @@ def test_a_street_of_look_alikes_is_laid_out_as_it_is():
     assert "look alike" in reason
 
 
+def test_doubt_by_disagreement_states_no_probability_of_two_places():
+    street = Street()
+    edges = [replace(e, look_alike=float("nan"), disagreement=0.05) for e in street.right]
+    edges += [replace(e, look_alike=float("nan"), disagreement=0.4) for e in street.wrong]
+    answer = optimize(street.ids, edges, params=QUICK)
+    assert uses(answer, street.wrong) == {"unused"}
+    assert not any("nan" in outcome.reason for outcome in answer.outcomes.values())
+
+
 @pytest.mark.parametrize(("gone", "parts"), [((7,), 2), ((4, 10), 3), ((4, 5, 10, 11, 12, 13), 2)])
 def test_look_alikes_that_contradict_each_other_tie_no_parts(gone, parts):
     """The street has gaps; its parts contradict look-alikes by themselves (one gap), or once laid over each other."""
