@@ -9,6 +9,7 @@ import numpy as np
 from gsmap.store import Store
 from gsmap.store.scenes import SceneSummary
 from gsmap.types import Scene
+from gsmap.types.registration import DEFORMATION_NOTES
 
 _MIN_DIFFERENCE = 0.005  # smaller fractions of the surface would be printed as 0 %
 
@@ -29,9 +30,7 @@ def undated_notes(store: Store, scenes: Collection[Scene | SceneSummary]) -> tup
     }
     differences = {pair: share for pair, share in differences.items() if share >= _MIN_DIFFERENCE}
     if differences:
-        from gsmap.register.deformation import NOTES  # imported here, as few maps need it
-
-        deformed = [one.registration for note in NOTES for one in store.registrations.current_with_note(note)]
+        deformed = (one.registration for one in store.registrations.current_with_note(*DEFORMATION_NOTES))
         ends = {f"{names.get(one.target)}:{names.get(one.source)}" for one in deformed}
         differences = {pair: share for pair, share in differences.items() if pair not in ends}
     if not differences:

@@ -25,10 +25,7 @@ from gsmap.register.params import Params
 from gsmap.register.scene_view import SceneView
 from gsmap.register.surface import Surface
 from gsmap.types import Sim3
-from gsmap.types.registration import Proposal
-
-NOTES = "one capture is bent: ", "one capture is stretched: "
-"""Beginnings of the notes on edges that no rigid pose aligns."""
+from gsmap.types.registration import DEFORMATION_NOTES, Proposal
 
 _RADII_M = (0.4, 0.25, 0.15, 0.1, 0.08, 0.08)  # of nearest cells: ends of stretched captures are off by decimetres
 _BORDER = 1.5  # cells between a point and its nearest cell, along the surface, at most
@@ -124,14 +121,14 @@ class Deformation:
             axis = _most_bent(self.warp)
             sag = float(np.linalg.norm(self.warp.bend @ axis @ axis)) * self.length_m / (4 * self.warp.radius)
             return (
-                f"{NOTES[0]}to fit the target, the source would have to bend along its direction "
+                f"{DEFORMATION_NOTES[0]}to fit the target, the source would have to bend along its direction "
                 f"({_text(axis)}) by {sag:.1%} of the length of the overlap; no rigid pose aligns all of it"
             )
         values, axes = np.linalg.eigh(self.warp.strain)
         odd = 0 if values[1] - values[0] > values[2] - values[1] else 2
         rest = values[[k for k in range(3) if k != odd]].mean()
         return (
-            f"{NOTES[1]}to fit the target, the source would have to change by "
+            f"{DEFORMATION_NOTES[1]}to fit the target, the source would have to change by "
             f"{values[odd] - rest:+.1%} along its direction ({_text(axes[:, odd])}), relative to the other directions; "
             "no rigid pose aligns all of it"
         )

@@ -256,13 +256,13 @@ class Registrations:
         found = (one for one in made if (one.usable or not usable) and one.target in living and one.source in living)
         return sorted(found, key=_ends_of)
 
-    def current_with_note(self, text: str) -> list[StoredRegistration]:
-        """Return the current registrations with a note that begins with a text, ordered by the pair's first
+    def current_with_note(self, *texts: str) -> list[StoredRegistration]:
+        """Return the current registrations with a note that begins with one of some texts, ordered by the pair's first
         registration."""
-        notes = type_coerce(registrations.c.notes, Text).contains(text, autoescape=True)
+        notes = type_coerce(registrations.c.notes, Text)
         with self._catalog.read() as connection:
-            found = _current(connection, unreviewed_if=notes)
-        return [one for one in found if any(note.startswith(text) for note in one.registration.notes)]
+            found = _current(connection, unreviewed_if=or_(*(notes.contains(text, autoescape=True) for text in texts)))
+        return [one for one in found if any(note.startswith(texts) for note in one.registration.notes)]
 
     def all_summaries(self) -> list[EdgeSummary]:
         """Return a summary of the current registration of every pair, of living and removed scenes, with the keys of

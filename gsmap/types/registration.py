@@ -13,6 +13,8 @@ from gsmap.reason_codes import reason_code
 from gsmap.types.sim3 import Sim3
 
 STATUSES = ("accepted", "rejected", "no_match")
+DEFORMATION_NOTES = "one capture is bent: ", "one capture is stretched: "
+"""Beginnings of the notes on edges that no rigid pose aligns."""
 
 
 class Support(Protocol):

@@ -16,8 +16,8 @@ from gsmap.geometry.warps import deform_gaussians
 from gsmap.map import Map
 from gsmap.map.changes.compare import standing_comparisons
 from gsmap.methods import RecipeKey
-from gsmap.register.deformation import NOTES
 from gsmap.types import Cameras, ChangeReport, EdgeOutcome, PosedScene, PoseGraph, Registration, ScenePose, Sim3
+from gsmap.types.registration import DEFORMATION_NOTES
 
 SAG_M = 0.16  # 4 % of four metres
 WENT = box(1.6, 1.2, 0.5, 0.4, 0.6, 6)
@@ -79,7 +79,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Map]:
         m.ingest(gaussians, cameras=cameras, name="july", captured_at="2026-07-15", scale="known")
         m.describe()
         a, b = (m.store.scenes.get(name).id for name in ("june", "july"))
-        note = f"{NOTES[0]}to fit"
+        note = f"{DEFORMATION_NOTES[0]}to fit"
         edge = Registration(a, b, "accepted", "", POSE, np.eye(7), 99, 99, 0.8, "test", notes=(note,))
         m.store.registrations.save(edge, RecipeKey("register", "pair", {"register": 1}).of(a, b))
         placed = {a: ScenePose(a, Sim3.identity(), 0, "placed"), b: ScenePose(b, POSE, 0, "placed")}

@@ -23,8 +23,8 @@ from gsmap.map.jobs import _warped
 from gsmap.map.stages.nonrigid import WarpedCaptures, deformed_pairs
 from gsmap.merge.tile import LazyScene
 from gsmap.methods import RecipeKey
-from gsmap.register.deformation import NOTES
 from gsmap.types import EdgeOutcome, Gaussians, PoseGraph, Registration, ScenePose, Sim3
+from gsmap.types.registration import DEFORMATION_NOTES
 
 SAG_M = 0.12  # 2 % of six metres
 BENT = {"left": False, "right": False, "bent": True, "after": True}
@@ -51,7 +51,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Map]:
         ids = {scene.name: scene.id for scene in m.scenes()}
         for (a, b), (overlap, is_deformed) in EDGES.items():
             S = poses[a].inverse() @ poses[b]
-            notes = (f"{NOTES[0]}to fit",) if is_deformed else ()
+            notes = (f"{DEFORMATION_NOTES[0]}to fit",) if is_deformed else ()
             made = Registration(ids[a], ids[b], "accepted", "", S, np.eye(7), 99, 99, overlap, "test", notes=notes)
             m.store.registrations.save(made, RecipeKey("register", "pair", {"register": 1}).of(a, b))
         placed = {ids[name]: ScenePose(ids[name], S, 0, "placed") for name, S in poses.items()}

@@ -16,8 +16,8 @@ def store(bent=(), **differences):
     ]
     noted = [SimpleNamespace(registration=edge) for edge in edges if edge.target[-1] + edge.source[-1] in bent]
 
-    def current_with_note(text):
-        return noted if text.startswith("one capture is bent") else []
+    def current_with_note(*texts):
+        return noted if any(text.startswith("one capture is bent") for text in texts) else []
 
     return SimpleNamespace(
         registrations=SimpleNamespace(summaries=lambda usable: edges, current_with_note=current_with_note)

@@ -24,7 +24,7 @@ from gsmap.map.stages.nonrigid import DeformedPair, deformed_pairs
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
 from gsmap.store.change_rows import Comparison
-from gsmap.types import ChangeReport, PosedScene, Scene, Sim3
+from gsmap.types import ChangeReport, PosedScene, PoseGraph, Scene, Sim3
 from gsmap.types.progress import StageProgress
 
 _NAMED = 5  # scenes that a remark names
@@ -57,26 +57,10 @@ def plan_comparisons(store: Store, settings: Settings, pair: tuple[Scene, Scene]
         NotFoundError: the map has no poses yet, or a scene that is named has no place.
         InputError: of two scenes that are named, which one is newer is not known, or they share no frame.
     """
-    graph = store.revisions.get()
-    if graph is None:
-        raise NotFoundError(
-            "the map has no poses yet, so that nothing can be compared: run gsmap update first", code="no_poses"
-        )
+    graph = _poses(store)
     scenes = store.scenes.list() if pair is None else list(pair)
     undated = [scene.name for scene in scenes if scene.captured_at is None]
-    metres = metres_of_scenes(store, graph)
-    visits = {
-        scene.id: Visit(
-            scene.id,
-            parse_moment(scene.captured_at),
-            pose.component,
-            in_metres(pose.S_map_scene, metres[scene.id]),
-            scene.bounds,
-            metres[scene.id],
-        )
-        for scene in scenes
-        if scene.captured_at is not None and (pose := graph.poses.get(scene.id)) is not None
-    }
+    visits = _visits(store, scenes, graph)
     if pair is None:
         unplaced = [scene.name for scene in scenes if scene.id not in graph.poses]
         notes = [f"{_names(undated)} no date: which one is newer is not known ({NO_DATE})"] if undated else []
@@ -120,8 +104,8 @@ def standing_comparisons(store: Store, settings: Settings) -> list[Comparison]:
     """Return the comparisons of visits that hold at the present poses, by whatever recipe, also of pairs that a person
     asked for: exports may act on their changes. Of deformed pairs only the current recipe holds, as another one may
     have compared them without a warp."""
-    asked = plan_comparisons(store, settings)
-    visits = asked.visits
+    graph = _poses(store)
+    visits = _visits(store, store.scenes.list(), graph)
     dated = (one for one in store.changes.current() if one.older in visits and one.newer in visits)
     found = [
         one
@@ -131,9 +115,7 @@ def standing_comparisons(store: Store, settings: Settings) -> list[Comparison]:
         and _stands(one, visits)
     ]
     pairs = [(one.older, one.newer) for one in found]
-    graph = store.revisions.get()
-    assert graph is not None
-    asked = replace(asked, deformed=deformed_pairs(store, settings, graph, pairs))
+    asked = ComparisonPlan(visits, pairs, (), deformed_pairs(store, settings, graph, pairs))
     return [
         one
         for one, pair in zip(found, pairs, strict=True)
@@ -208,6 +190,37 @@ def _job(store: Store, asked: ComparisonPlan, settings: Settings, pair: tuple[st
     """Return the arguments of `compare_scenes`."""
     sides = [(visit.scene, visit.S_map_scene, visit.when.isoformat()) for visit in (asked.visits[s] for s in pair)]
     return (store.location, *sides, settings.change, asked.deformed.get(pair))
+
+
+def _poses(store: Store) -> PoseGraph:
+    """Return the newest poses.
+
+    Raises:
+        NotFoundError: the map has no poses yet.
+    """
+    graph = store.revisions.get()
+    if graph is None:
+        raise NotFoundError(
+            "the map has no poses yet, so that nothing can be compared: run gsmap update first", code="no_poses"
+        )
+    return graph
+
+
+def _visits(store: Store, scenes: Iterable[Scene], graph: PoseGraph) -> dict[str, Visit]:
+    """Return the visits of the scenes that have a date and a pose, by scene id."""
+    metres = metres_of_scenes(store, graph)
+    return {
+        scene.id: Visit(
+            scene.id,
+            parse_moment(scene.captured_at),
+            pose.component,
+            in_metres(pose.S_map_scene, metres[scene.id]),
+            scene.bounds,
+            metres[scene.id],
+        )
+        for scene in scenes
+        if scene.captured_at is not None and (pose := graph.poses.get(scene.id)) is not None
+    }
 
 
 def _names(names: Sequence[str]) -> str:

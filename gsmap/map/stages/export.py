@@ -30,6 +30,7 @@ from gsmap.map.metric_scales import map_metres, metre_notes
 from gsmap.map.rejected_changes import places_near, rejected_places
 from gsmap.map.settings import Settings
 from gsmap.map.shared_jobs import note_interruption
+from gsmap.map.stages.nonrigid import rigid_note, warp_captures
 from gsmap.merge import merger, photos_m, reach_m, recipe_key, uses_dates, with_prefer, with_steps
 from gsmap.merge.reference_view_cache import ReferenceViewCache
 from gsmap.methods import text_digest
@@ -159,8 +160,6 @@ def plan(store: Store, request: Request, settings: Settings, find_omitted: FindO
         placed = {scene: placed[scene] for scene in scenes}
     bounds = {scene: found.bounds for scene, found in scenes.items()}
     warps: dict[str, tuple[Warp, float]] = {}
-    from gsmap.map.stages.nonrigid import rigid_note, warp_captures  # imported here, as it imports registration
-
     if request.nonrigid:
         warped = warp_captures(store, settings, graph, placed, scenes)
         placed, notes = {**placed, **warped.poses}, notes + warped.notes

@@ -14,12 +14,11 @@ from gsmap.map.jobs import load_view
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys, without_graph
 from gsmap.methods import text_digest
-from gsmap.register import VERSION
-from gsmap.register.deformation import NOTES, warp_onto
 from gsmap.store import Store
 from gsmap.texts import counted, few
 from gsmap.types import PoseGraph, Registration, Scene, ScenePose, Sim3
 from gsmap.types.plain import canonical, plain
+from gsmap.types.registration import DEFORMATION_NOTES
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +53,8 @@ class DeformedPair:
 
     def inputs(self) -> list[str]:
         """Return what a warp depends on besides the pose, for the key of a result."""
+        from gsmap.register import VERSION  # imported for deformed captures alone: planning needs no registration
+
         return [f"warped {VERSION}", *(f"graph {scene} {self.graphs[scene]}" for scene in sorted(self.graphs))]
 
     def fit(self, store: Store, target: str, source: str, S_target_source: Sim3) -> tuple[Sim3, Warp | None] | None:
@@ -61,6 +62,8 @@ class DeformedPair:
         where a graph is missing or the overlap is too small."""
         if len(self.graphs) < 2:
             return None
+        from gsmap.register.deformation import warp_onto
+
         views = [load_view(store, scene, self.graphs[scene]) for scene in (target, source)]
         return warp_onto(views[0], views[1], S_target_source, with_scale=self.with_scale)
 
@@ -109,6 +112,8 @@ def warp_captures(
     if missing := without_graph(store, keys):
         name = scenes[missing[0]].name
         raise InputError(f"scene {name} has no graph: run gsmap describe MAP {name!r} first", code="no_graph")
+    from gsmap.register.deformation import warp_onto
+
     poses, warps, notes = dict[str, ScenePose](), dict[str, Warp](), list[str]()
     for component in sorted(components):
         anchor, tree = _spanning_tree([edge for edge in edges if placed[edge.ends[0]].component == component], scenes)
@@ -145,7 +150,7 @@ def deformed_pairs(
 ) -> dict[tuple[str, str], DeformedPair]:
     """Return the pairs of scenes that no rigid pose may align: their own edge is named as stretched or bent, or they
     have none and no path of other edges joins them."""
-    if not pairs or not any(store.registrations.current_with_note(note) for note in NOTES):
+    if not pairs or not store.registrations.current_with_note(*DEFORMATION_NOTES):
         return {}
     edges = {frozenset(edge.ends): edge for edge in _used_edges(store, graph, graph.poses)}
     shapes = {scene: {scene} for scene in graph.poses}
@@ -156,19 +161,18 @@ def deformed_pairs(
             shapes |= dict.fromkeys(source, target)
     own = {pair: edges.get(frozenset(pair)) for pair in pairs}
     deformed = {graph.poses[edge.ends[0]].component for edge in edges.values() if edge.is_deformed}
-    found = [
-        pair
+    found = {
+        pair: edge
         for pair, edge in own.items()
         if (edge.is_deformed if edge else graph.poses[pair[0]].component in deformed and pair[1] not in shapes[pair[0]])
-    ]
+    }
     scenes = [store.scenes.get(scene) for scene in sorted({scene for pair in found for scene in pair})]
     keys = graph_keys(store, scenes, settings)
     lacking = without_graph(store, keys)
     graphs = {scene: key.digest for scene, key in keys.items() if scene not in lacking}
     return {
         pair: DeformedPair({scene: graphs[scene] for scene in pair if scene in graphs}, bool(edge and edge.with_scale))
-        for pair, edge in own.items()
-        if pair in found
+        for pair, edge in found.items()
     }
 
 
@@ -176,7 +180,7 @@ def rigid_note(
     store: Store, graph: PoseGraph, placed: Mapping[str, ScenePose], scenes: Mapping[str, Scene]
 ) -> tuple[str, ...]:
     """Return a note on the pairs that no rigid pose aligns, for a merge that warps nothing."""
-    if not any(store.registrations.current_with_note(note) for note in NOTES):
+    if not store.registrations.current_with_note(*DEFORMATION_NOTES):
         return ()
     edges = [edge for edge in _used_edges(store, graph, placed) if edge.is_deformed]
     if not edges:
@@ -191,7 +195,7 @@ def rigid_note(
 def _used_edges(store: Store, graph: PoseGraph, placed: Mapping[str, ScenePose]) -> list[_Edge]:
     found = (one.registration for one in store.registrations.current_usable(placed))
     return [
-        _Edge(one, any(note.startswith(NOTES) for note in one.notes))
+        _Edge(one, any(note.startswith(DEFORMATION_NOTES) for note in one.notes))
         for one in found
         if graph.use(one.target, one.source) != "unused"
         and placed[one.target].component == placed[one.source].component
