@@ -104,10 +104,16 @@ def rows_of_registrations(store: Store, edges: Iterable[StoredRegistration], *sc
     Args:
         scenes: ids, at least one of each pair; all where none is named.
     """
-    edges, newest = list(edges), store.revisions.newest()
-    unsolved = store.registrations.changed_since(newest.created_at if newest else "", edges)
+    edges = list(edges)
+    unsolved = _unsolved(store, edges)
     outcomes, name_of = store.revisions.outcomes(*(scenes if len(scenes) <= _FEW else ())), names(store)
     return [_edge_row(stored, outcomes, name_of, stored.number in unsolved) for stored in edges]
+
+
+def _unsolved(store: Store, edges: Iterable[StoredRegistration]) -> set[int]:
+    """Return the numbers of those registrations that the last optimize did not use as they are now."""
+    newest = store.revisions.newest()
+    return store.registrations.changed_since(newest.created_at if newest else "", edges)
 
 
 def _edge_row(stored: StoredRegistration, outcomes: Outcomes, name_of: Mapping[str, str], unsolved: bool) -> EdgeRow:
@@ -163,7 +169,7 @@ def pair_report(store: Store, a: Scene, b: Scene) -> PairReport:
     outcomes, edge = store.revisions.outcomes(a.id), current.registration
     outcome = outcomes.get((edge.target, edge.source))
     return PairReport(
-        **vars(rows_of_registrations(store, [current], a.id)[0]),
+        **vars(_edge_row(current, outcomes, {a.id: a.name, b.id: b.name}, bool(_unsolved(store, [current])))),
         exact=edge.exact,
         evidence=edge.evidence,
         residual_chi2=outcome.residual_chi2 if outcome else None,
